@@ -1,0 +1,132 @@
+"""Objects from config sections, by allow-listed class names and checked signatures.
+
+A section is ``_target_`` and keyword arguments. The resolved config is stored in every artifact, and a later
+stage builds from the artifact's own config, so a section is untrusted input: ``_target_`` may only name a class
+that is defined in one of :data:`ALLOWED_PACKAGES`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from sagemp_cli.errors import ConfigError, did_you_mean
+
+ALLOWED_PACKAGES = ("dynamics", "planners", "trackers", "reachability", "experts")
+"""Subpackages of sagemp_cli whose classes a config may name as ``_target_``."""
+
+FROM_DATA = ("state_dim", "control_dim", "horizon", "dt")
+"""Arguments that the stages take from the robot and the horizon; a config need not give them."""
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def target_class(section: Mapping[str, Any], where: str) -> type:
+    """The class that a section's ``_target_`` names, if the allow-list permits it."""
+    target = section.get("_target_")
+    if not isinstance(target, str):
+        raise ConfigError(f"{where}._target_ must name a class, found {target!r}")
+    parts = target.split(".")
+    if len(parts) < 3 or parts[0] != "sagemp_cli" or parts[1] not in ALLOWED_PACKAGES:
+        allowed = ", ".join(f"sagemp_cli.{p}" for p in ALLOWED_PACKAGES)
+        raise ConfigError(f"{where}._target_ '{target}' is not allowed; targets must be classes of {allowed}")
+    module_name, name = ".".join(parts[:-1]), parts[-1]
+    source = _PACKAGE.joinpath(*parts[1:-1])
+    if not (source.with_suffix(".py").is_file() or (source / "__init__.py").is_file()):
+        raise ConfigError(f"{where}._target_ '{target}': there is no module {module_name}")
+    found = getattr(importlib.import_module(module_name), name, None)
+    if not inspect.isclass(found) or found.__module__ != module_name:
+        raise ConfigError(f"{where}._target_ '{target}': {module_name} defines no class {name}")
+    return found
+
+
+def complaints(section: Mapping[str, Any], where: str, **extra: Any) -> list[str]:
+    """Everything that is wrong with a section: its target, unknown and missing options, values of the wrong type.
+
+    Args:
+        section: ``_target_`` and keyword arguments.
+        where: name of the section in messages.
+        extra: further keyword arguments that come from data, not from the config.
+    """
+    try:
+        cls = target_class(section, where)
+    except ConfigError as e:
+        return [str(e)]
+    arguments = {k: v for k, v in section.items() if k != "_target_"} | extra
+    parameters, hints = inspect.signature(cls).parameters, get_type_hints(cls.__init__)
+    found = []
+    for key, value in arguments.items():
+        if key not in parameters:
+            near = did_you_mean(key, parameters) or f"; it has {', '.join(parameters) or 'none'}"
+            found.append(f"{where}.{key}: {cls.__name__} has no such option{near}")
+        elif key not in extra and not _fits(value, hints.get(key, Any)):
+            found.append(f"{where}.{key} must be {parameters[key].annotation}, found {value!r}")
+    missing = [k for k, p in parameters.items() if p.default is p.empty and k not in arguments]
+    if missing:
+        found.append(f"{where}: {cls.__name__} needs {', '.join(missing)}")
+    return found
+
+
+def all_complaints(config: Mapping[str, Any]) -> list[str]:
+    """The complaints about every section of a config that names a class."""
+    return [
+        complaint
+        for name, section in config.items()
+        if isinstance(section, Mapping) and "_target_" in section
+        for complaint in complaints(section, name)
+        if not _only_from_data(complaint)
+    ]
+
+
+def _only_from_data(complaint: str) -> bool:
+    _, needs, names = complaint.partition(" needs ")
+    return bool(needs) and set(names.split(", ")) <= set(FROM_DATA)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether plain config data fits a type hint; hints of other things than plain data fit everything."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, h) for h in inner)
+    if origin in (list, tuple, Sequence):
+        items = inner[:1] or (Any,)
+        return isinstance(value, list | tuple) and all(_fits(v, items[0]) for v in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (bool, str, type(None)):
+        return isinstance(value, hint)
+    return True
+
+
+def arguments_of(section: Mapping[str, Any], where: str, **extra: Any) -> dict[str, Any]:
+    """The keyword arguments of a section (plus ``extra``), checked against the constructor's signature.
+
+    Raises:
+        ConfigError: one line with all :func:`complaints`.
+    """
+    wrong = complaints(section, where, **extra)
+    if wrong:
+        raise ConfigError("; ".join(wrong))
+    return {k: v for k, v in section.items() if k != "_target_"} | extra
+
+
+def build(section: Mapping[str, Any], where: str, **extra: Any) -> Any:
+    """Build the object that a config section describes.
+
+    Args:
+        section: ``_target_`` and keyword arguments.
+        where: name of the section in messages.
+        extra: further keyword arguments that come from data, not from the config.
+    """
+    arguments = arguments_of(section, where, **extra)
+    try:
+        return target_class(section, where)(**arguments)
+    except (TypeError, ValueError) as e:
+        first = next((line for line in str(e).splitlines() if line.strip()), type(e).__name__)
+        raise ConfigError(f"{where}: {first.strip()}") from e

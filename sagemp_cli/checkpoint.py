@@ -1,0 +1,77 @@
+"""Snapshots of unfinished work: named arrays and one line of text in an HDF5 file, replaced atomically.
+
+A checkpoint is private to the run that wrote it: it is not an artifact, nobody else reads it, and the run's
+caller deletes it when the work is done. It holds plain arrays only, so reading one never runs code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.storage.atomic import hdf5_image, reason_of, write_whole
+
+_SCHEMA = "sagemp-checkpoint-1"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds.
+
+    Attributes:
+        identity: one line that says which work this is; a run resumes only from a checkpoint of its own identity.
+        arrays: arrays of numbers by name; a ``/`` in a name makes an HDF5 group.
+    """
+
+    identity: str
+    arrays: Mapping[str, np.ndarray]
+
+
+def write_checkpoint(path: Path, content: Checkpoint) -> None:
+    """Write ``content`` so that ``path`` holds either the old or the new checkpoint, even after a power cut.
+
+    Raises:
+        ResourceError: the disk is full or the folder cannot be written.
+    """
+
+    def fill(file: h5py.File) -> None:
+        file.attrs["schema"] = _SCHEMA
+        file.attrs["identity"] = content.identity
+        for name, value in content.arrays.items():
+            file.create_dataset(name, data=value)
+
+    write_whole(path, hdf5_image(fill), overwrite=True)
+
+
+def read_checkpoint(path: Path, *, identity: str) -> Checkpoint:
+    """Read back what :func:`write_checkpoint` wrote, to the last bit.
+
+    Raises:
+        ArtifactError: the file is damaged, no checkpoint, or belongs to work of another ``identity``.
+    """
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            schema, found = file.attrs.get("schema"), file.attrs.get("identity")
+            arrays: dict[str, np.ndarray] = {}
+
+            def collect(name: str, node: h5py.Group | h5py.Dataset) -> None:
+                if isinstance(node, h5py.Dataset):
+                    arrays[name] = node[()]
+
+            file.visititems(collect)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise ArtifactError(
+            f"cannot read the checkpoint {path} ({reason_of(error)}); delete it to start over"
+        ) from None
+    if schema != _SCHEMA:
+        raise ArtifactError(f"{path} is not a checkpoint (schema {schema!r}, expected '{_SCHEMA}')")
+    if found != identity:
+        raise ArtifactError(
+            f"the checkpoint {path} belongs to other work ('{found}', expected '{identity}'); delete it to start over"
+        )
+    return Checkpoint(identity, arrays)

@@ -1,0 +1,68 @@
+"""``sagemp config show | validate | list``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from sagemp_cli.cli.command import Command, examples
+from sagemp_cli.cli.options import Overrides
+from sagemp_cli.errors import ConfigError, UsageError
+
+app = typer.Typer(no_args_is_help=True, help="Show, check and list the configuration.", rich_markup_mode="rich")
+
+
+@app.command(cls=Command, epilog=examples("sagemp config show", "sagemp config show experiment=unicycle_node seed=3"))
+def show(overrides: Overrides = None) -> None:
+    """Print the resolved config, as it is stored in every artifact."""
+    import yaml
+
+    from sagemp_cli.config import compose
+
+    typer.echo(yaml.safe_dump(compose(overrides or []), sort_keys=False, default_flow_style=None), nl=False)
+
+
+@app.command(cls=Command, epilog=examples("sagemp config validate", "sagemp config validate planner.hidden=64"))
+def validate(overrides: Overrides = None) -> None:
+    """Bind every option of every group to what it configures and report all errors at once.
+
+    With overrides, the config that they give is checked instead.
+    """
+    from sagemp_cli.config import compose, groups, options_of
+    from sagemp_cli.stages.requirements import require_sound_config
+
+    choices = [list(overrides)] if overrides else [[f"{g}={o}"] for g in groups() for o in options_of(g)]
+    wrong = []
+    for choice in choices:
+        try:
+            require_sound_config(compose(choice))
+        except UsageError as e:
+            wrong.append(f"{' '.join(choice)}: {e}")
+    for line in wrong:
+        typer.echo(line, err=True)
+    if wrong:
+        raise ConfigError(f"{len(wrong)} of {len(choices)} configs are wrong, see the lines above")
+    typer.echo(f"{len(choices)} config{'s' if len(choices) > 1 else ''} checked, no errors")
+
+
+@app.command("list", cls=Command, epilog=examples("sagemp config list", "sagemp config list experiment=unicycle_node"))
+def list_options(overrides: Overrides = None) -> None:
+    """List the config groups and their options; the ones in use are marked with a star."""
+    from sagemp_cli.config import chosen_options, groups, options_of, resource_folder
+
+    chosen = chosen_options(overrides or [])
+    for group in groups():
+        typer.echo(group)
+        for option in options_of(group):
+            mark = "*" if chosen.get(group) == option else " "
+            note = _first_comment(resource_folder("conf") / group / f"{option}.yaml")
+            typer.echo(f"  {mark} {option:<28}{note}".rstrip())
+
+
+def _first_comment(path: Path) -> str:
+    """The first line of a file that is a comment for people."""
+    lines: Any = path.read_text(encoding="utf-8").splitlines()
+    comments = (line[1:].strip() for line in lines if line.startswith("#") and "@package" not in line)
+    return next(comments, "")

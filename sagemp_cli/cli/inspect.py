@@ -1,0 +1,143 @@
+"""``sagemp inspect``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.options import Json
+
+if TYPE_CHECKING:
+    from sagemp_cli.storage import Artifact, Kind
+
+EXAMPLES = examples(
+    "sagemp inspect artifacts/unicycle_node/certificate.h5",
+    "sagemp inspect artifacts/unicycle_node/library.h5 --json",
+)
+
+
+def inspect(
+    file: Annotated[Path, typer.Argument(help="An artifact, i.e. an HDF5 file that a stage wrote.")],
+    as_json: Json = False,
+) -> None:
+    """Show what an artifact is, how and from what it was made, and what it holds.
+
+    Everything is read and checked against the declaration of its kind; parents are compared by hash.
+    """
+    from sagemp_cli.storage import open_header, read_artifact
+
+    kind, _ = open_header(file)
+    artifact = read_artifact(file, kind.record)
+    content = describe(kind, artifact)
+    if as_json:
+        typer.echo(json.dumps(content, indent=2))
+    else:
+        _print(content)
+
+
+def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
+    """An artifact's kind, provenance, fields and verdicts as plain data."""
+    header = artifact.header
+    return {
+        "file": str(artifact.path),
+        "kind": kind.name,
+        "format": kind.version,
+        "sha256": artifact.sha256,
+        "stage": header.stage,
+        "experiment": header.experiment,
+        "seed": header.seed,
+        "created_utc": header.created_utc,
+        "seconds": header.seconds,
+        "version": header.version,
+        "device": header.device,
+        "packages": dict(header.packages),
+        "parents": [
+            {"role": p.role, "file": p.path, "sha256": p.sha256, "now": _now(artifact.path.parent / p.path, p.sha256)}
+            for p in header.parents
+        ],
+        "fields": list(_fields(artifact.record, "")),
+        "verdicts": _verdicts(artifact.record),
+    }
+
+
+def _now(path: Path, sha256: str) -> str:
+    from sagemp_cli.storage import sha256_of
+
+    if not path.is_file():
+        return "not there"
+    return "unchanged" if sha256_of(path) == sha256 else "changed since"
+
+
+def _fields(record: Any, prefix: str) -> list[dict[str, str]]:
+    """One row per field: name, shape or value, named dimensions, units, meaning."""
+    import numpy as np
+
+    rows: list[dict[str, str]] = []
+    for f in dataclasses.fields(record):
+        value, meta, name = getattr(record, f.name), f.metadata, f"{prefix}{f.name}"
+        row = {"name": name, "holds": "", "dims": " ".join(meta.get("dims", ())), "units": meta.get("units", "")}
+        row["doc"] = meta["doc"]
+        match meta["form"]:
+            case "array":
+                row["holds"] = "-" if value is None else f"{value.dtype} {tuple(value.shape)}"
+            case "texts":
+                row["holds"] = "-" if value is None else f"text ({len(value)},)"
+            case "scalar":
+                text = str(value)
+                row["holds"] = text if len(text) <= 60 else f"{text[:57]}..."
+            case "weights":
+                count = sum(int(np.size(w)) for w in value.values())
+                row["holds"] = f"{len(value)} arrays, {count} numbers"
+            case "group" if meta["many"]:
+                row["holds"] = f"{len(value)} groups"
+        rows.append(row)
+        if meta["form"] == "weights":
+            rows += [
+                {"name": f"{name}/{k}", "holds": f"{w.dtype} {tuple(w.shape)}", "dims": "", "units": "", "doc": ""}
+                for k, w in value.items()
+            ]
+        if meta["form"] == "group":
+            items = value if meta["many"] else () if value is None else (value,)
+            for i, item in enumerate(items):
+                rows += _fields(item, f"{name}/{f'{i:06d}/' if meta['many'] else ''}")
+    return rows
+
+
+def _verdicts(record: Any) -> list[str]:
+    tubes = getattr(record, "tubes", None)
+    if tubes is None:
+        return []
+    lines = [str(record.verdict)] if hasattr(record, "verdict") else []
+    for i, verdict in enumerate(tubes.verdict):
+        decided = f" at step {tubes.step[i]} ({tubes.constraint[i]})" if tubes.step[i] >= 0 else ""
+        lines.append(f"reference {i}: {verdict}{decided}")
+    return lines
+
+
+def _print(content: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for key in ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256"):
+        value = content[key]
+        facts.add_row(Text(key, style="bold"), Text(f"{value:.1f}" if isinstance(value, float) else str(value)))
+    facts.add_row(Text("packages", style="bold"), Text(", ".join(f"{k} {v}" for k, v in content["packages"].items())))
+    for parent in content["parents"]:
+        facts.add_row(Text("made from", style="bold"), Text(f"{parent['file']} ({parent['now']})"))
+    for line in content["verdicts"]:
+        facts.add_row(Text("verdict", style="bold"), Text(line))
+    console.print(facts)
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("name", "holds", "dims", "units", "doc"):
+        table.add_column(column, overflow="fold")
+    for row in content["fields"]:
+        table.add_row(*(Text(row[c]) for c in ("name", "holds", "dims", "units", "doc")))
+    console.print(table)

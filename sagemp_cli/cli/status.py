@@ -1,0 +1,68 @@
+"""``sagemp status``."""
+
+from __future__ import annotations
+
+import json
+
+import typer
+
+from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.options import Json, Overrides, Partitions, Seed, overrides_of
+from sagemp_cli.cli.stage_command import context_of
+
+EXAMPLES = examples(
+    "sagemp status",
+    "sagemp status experiment=unicycle_node effort=demo",
+    "sagemp status --json | jq '.files\\[].state'",
+)
+_STYLES = {"fresh": "green", "stale": "yellow", "missing": "dim", "damaged": "red"}
+
+
+def status(
+    overrides: Overrides = None, partitions: Partitions = None, seed: Seed = None, as_json: Json = False
+) -> None:
+    """Show an experiment's graph of files: fresh, stale, missing or damaged, and why.
+
+    A file is stale if a config key that it depends on, or one of its inputs, has changed since it was made.
+    """
+    from sagemp_cli.stages.freshness import survey
+
+    context = context_of(overrides_of(overrides, seed=seed, partitions=partitions))
+    states = survey(context)
+    if as_json:
+        files = [
+            {
+                "stage": name,
+                "file": str(state.path),
+                "inputs": list(state.stage.inputs),
+                "state": str(state.freshness),
+                "why": state.why,
+                "created_utc": state.header.created_utc if state.header else None,
+                "seconds": state.header.seconds if state.header else None,
+                "sha256": state.sha256 or None,
+            }
+            for name, state in states.items()
+        ]
+        typer.echo(
+            json.dumps({"experiment": context.config["name"], "folder": str(context.folder), "files": files}, indent=2)
+        )
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=f"{context.config['name']} in {context.folder}", title_justify="left", box=None, padding=(0, 2, 0, 0)
+    )
+    for column in ("stage", "reads", "file", "state", "made (UTC)", "why"):
+        table.add_column(column, overflow="fold")
+    for name, state in states.items():
+        table.add_row(
+            name,
+            ", ".join(states[i].stage.role for i in state.stage.inputs) or "-",
+            state.path.name,
+            Text(str(state.freshness), style=_STYLES[state.freshness]),
+            state.header.created_utc.removesuffix("+00:00") if state.header else "",
+            Text(state.why),
+        )
+    Console().print(table)

@@ -1,0 +1,94 @@
+"""What a certificate says, for people, for machines and as an exit code."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sagemp_cli.errors import EXIT_CERTIFIED, EXIT_FALSIFIED, EXIT_UNKNOWN, ArtifactError
+
+if TYPE_CHECKING:
+    from sagemp_cli.storage import Artifact, Certificate
+
+_CODES = {"VERIFIED": EXIT_CERTIFIED, "FALSIFIED": EXIT_FALSIFIED, "UNKNOWN": EXIT_UNKNOWN}
+
+
+def read_certificate(path: Path) -> Artifact[Certificate]:
+    """The certificate in a file.
+
+    Raises:
+        ArtifactError: not a certificate, or one with a verdict that does not exist.
+    """
+    from sagemp_cli.storage import Certificate, read_artifact
+
+    artifact = read_artifact(path, Certificate)
+    if artifact.record.verdict not in _CODES:
+        raise ArtifactError(f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(_CODES)}")
+    return artifact
+
+
+def exit_code(certificate: Artifact[Certificate]) -> int:
+    """0 certified, 10 falsified, 5 unknown."""
+    return _CODES[certificate.record.verdict]
+
+
+def as_lines(certificate: Artifact[Certificate]) -> list[str]:
+    """The verdict and what decided it, where the files are."""
+    data = as_json(certificate)
+    what = f"experiment {data['experiment']}, K = {data['horizon']}, {data['propagator']}"
+    counted = f"{data['certified']} of {len(data['references'])} references certified, {data['cells']} cells"
+    lines = [f"{data['verdict']}: {counted} ({what}{'' if data['rigorous'] else ', rounding not included'})"]
+    for i, item in enumerate(data["references"]):
+        if item["verdict"] == "SAFE":
+            near = f", keeps {item['clearance']:.3g} m from {item['nearest']}" if item["nearest"] else ""
+            lines.append(f"  reference {i}: SAFE at all steps{near}")
+        else:
+            lines.append(f"  reference {i}: {item['verdict']} at step {item['step']} ({item['constraint']})")
+    lines += [
+        f"  counterexample: reference {c['reference']}, {c['kind']} at step {c['step']} ({c['constraint']}),"
+        f" {c['depth']:.3g} deep"
+        for c in data["counterexamples"]
+    ]
+    lines.append(f"certificate {data['certificate']}")
+    if data["figure"]:
+        lines.append(f"figure      {data['figure']}")
+    return lines
+
+
+def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
+    """The same as plain data."""
+    record, tubes = certificate.record, certificate.record.tubes
+    figure = certificate.path.with_suffix(".png")
+    references = []
+    for i, verdict in enumerate(tubes.verdict):
+        clearance = tubes.clearance[i]
+        nearest = int(clearance.argmin()) if len(clearance) and math.isfinite(clearance.min()) else None
+        references.append(
+            {
+                "verdict": verdict,
+                "step": None if tubes.step[i] < 0 else int(tubes.step[i]),
+                "constraint": tubes.constraint[i],
+                "clearance": None if nearest is None else float(clearance[nearest]),
+                "nearest": None if nearest is None else tubes.constraint_names[nearest],
+            }
+        )
+    return {
+        "verdict": record.verdict,
+        "exit_code": exit_code(certificate),
+        "experiment": certificate.header.experiment,
+        "horizon": int(tubes.references.shape[1] - 1),
+        "propagator": tubes.propagator,
+        "rigorous": tubes.rigorous,
+        "cells": len(tubes.cell_reference),
+        "certified": sum(v == "SAFE" for v in tubes.verdict),
+        "references": references,
+        "counterexamples": [
+            {"reference": c.reference, "kind": c.kind, "step": c.step, "constraint": c.constraint, "depth": c.depth}
+            for c in record.counterexamples
+        ],
+        "falsifier_rollouts": record.falsifier_rollouts,
+        "seconds": certificate.header.seconds,
+        "certificate": str(certificate.path),
+        "figure": str(figure) if figure.exists() else None,
+    }

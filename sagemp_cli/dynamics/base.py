@@ -1,0 +1,85 @@
+"""What every robot model offers, and the discrete step written once.
+
+A model is written as plain torch operations on ``(x, u)``. The same function is simulated on tensors,
+differentiated in training, bounded by every propagator and re-checked in ball arithmetic, so it may use
+only operations for which the propagators have a relaxation (an unknown one is an error that names it).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from sagemp_cli.errors import ConfigError
+
+DISTURBANCE_READINGS = ("derivative", "state")
+
+
+class Dynamics(nn.Module):
+    """Base of all robot models, ``x_{k+1} = f(x_k, u_k, w_k)`` (paper, equation 1).
+
+    A subclass sets the class attributes and implements :meth:`derivative`.
+
+    The paper leaves open how w enters. ``disturbance="derivative"`` (default) reads
+    ``x_{k+1} = x_k + dt (f(x_k, u_k) + w_k)``; ``disturbance="state"`` reads
+    ``x_{k+1} = x_k + dt f(x_k, u_k) + w_k``.
+    """
+
+    state_names: ClassVar[tuple[str, ...]]
+    state_units: ClassVar[tuple[str, ...]]
+    control_names: ClassVar[tuple[str, ...]]
+    control_units: ClassVar[tuple[str, ...]]
+    position: ClassVar[tuple[int, ...]]
+    """Indices of the state that are the position in the scene."""
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        control_lower: list[float],
+        control_upper: list[float],
+        state_lower: list[float],
+        state_upper: list[float],
+        disturbance: str = "derivative",
+    ) -> None:
+        super().__init__()
+        name = type(self).__name__
+        if not 0 < dt < float("inf"):
+            raise ConfigError(f"{name}: dt must be a positive number of seconds, found {dt}")
+        if disturbance not in DISTURBANCE_READINGS:
+            raise ConfigError(f"{name}: disturbance must be one of {DISTURBANCE_READINGS}, found '{disturbance}'")
+        self.dt = float(dt)
+        self.disturbance = disturbance
+        for key, values, size in (
+            ("control_lower", control_lower, self.control_dim),
+            ("control_upper", control_upper, self.control_dim),
+            ("state_lower", state_lower, self.state_dim),
+            ("state_upper", state_upper, self.state_dim),
+        ):
+            if len(values) != size:
+                raise ConfigError(f"{name}: {key} needs {size} numbers, found {len(values)}")
+            self.register_buffer(key, torch.tensor([float(v) for v in values], dtype=torch.float64), persistent=False)
+        if bool((self.control_lower >= self.control_upper).any() | (self.state_lower >= self.state_upper).any()):
+            raise ConfigError(f"{name}: every lower limit must lie below its upper limit")
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+        return len(self.state_names)
+
+    @property
+    def control_dim(self) -> int:
+        """Number of controls m."""
+        return len(self.control_names)
+
+    def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed state derivative ``f(x, u)``; ``x (..., n)``, ``u (..., m)`` to ``(..., n)``."""
+        raise NotImplementedError
+
+    def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """One forward-Euler step under the disturbance ``w (..., n)``; see the class for how w enters."""
+        if self.disturbance == "derivative":
+            return x + self.dt * (self.derivative(x, u) + w)
+        return x + self.dt * self.derivative(x, u) + w

@@ -1,0 +1,42 @@
+"""The planar quadrotor of the paper's appendix: six states, two controls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+
+
+class PlanarQuadrotor(Dynamics):
+    """``x = [px, pz, phi, vx, vz, omega]``, ``u = [thrust, torque]``.
+
+    ``vx' = -(u1/m) sin(phi), vz' = g + (u1/m) cos(phi), omega' = u2 / I_y`` with the paper's ``m = 0.5 kg``,
+    ``g = -9.81 m/s^2`` and ``I_y = 0.01 kg m^2`` as defaults.
+    """
+
+    state_names = ("px", "pz", "phi", "vx", "vz", "omega")
+    state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names = ("thrust", "torque")
+    control_units = ("N", "N m")
+    position = (0, 1)
+
+    def __init__(self, *, mass: float = 0.5, gravity: float = -9.81, inertia: float = 0.01, **limits: Any) -> None:
+        super().__init__(**limits)
+        self.mass, self.gravity, self.inertia = float(mass), float(gravity), float(inertia)
+
+    def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        phi, lift = x[..., 2], u[..., 0] / self.mass
+        return torch.stack(
+            [
+                x[..., 3],
+                x[..., 4],
+                x[..., 5],
+                -lift * torch.sin(phi),
+                self.gravity + lift * torch.cos(phi),
+                u[..., 1] / self.inertia,
+            ],
+            dim=-1,
+        )

@@ -1,0 +1,26 @@
+"""The unicycle with speed as a state (LaValle 2006, equation 13.18, extended by acceleration)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+
+
+class Unicycle(Dynamics):
+    """``x = [px, py, theta, v]``, ``u = [turn rate, acceleration]``.
+
+    ``px' = v cos(theta), py' = v sin(theta), theta' = turn rate, v' = acceleration``. The paper cites an
+    equation with three states but lists four entries in its tables; this is the four-state reading.
+    """
+
+    state_names = ("px", "py", "theta", "v")
+    state_units = ("m", "m", "rad", "m/s")
+    control_names = ("turn_rate", "acceleration")
+    control_units = ("rad/s", "m/s^2")
+    position = (0, 1)
+
+    def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        theta, v = x[..., 2], x[..., 3]
+        return torch.stack([v * torch.cos(theta), v * torch.sin(theta), u[..., 0], u[..., 1]], dim=-1)

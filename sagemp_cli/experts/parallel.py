@@ -1,0 +1,101 @@
+"""Demonstrations from several processes, handed over one by one as they are finished."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from itertools import islice
+
+import torch
+
+from sagemp_cli.errors import ConfigError, ResourceError
+from sagemp_cli.experts.problems import Demonstration, Expert, Problem, solve_problem
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_expert: Expert | None = None  # a worker's own copy, sent once when it starts
+
+
+def solve_problems(
+    problems: Sequence[Problem], expert: Expert, *, processes: int = 2, done: Collection[int] = ()
+) -> Iterator[Demonstration]:
+    """Solve all problems whose index is not in ``done``; yields in the order in which they finish.
+
+    A demonstration depends on its problem and the expert alone, so neither the order nor the number of processes nor
+    a resumed run changes it. Workers are spawned with one thread each and ignore Ctrl-C, which is the caller's:
+    closing the iterator (or an exception in the caller) drops what has not begun, waits for what has, and ends them.
+
+    Args:
+        problems: from :func:`~sagemp_cli.experts.problems.plan_demonstrations`.
+        expert: what they have in common.
+        processes: number of worker processes; 0 solves here, in order.
+        done: indices that were solved before.
+
+    Raises:
+        ConfigError: a negative number of processes.
+        ResourceError: a worker process died.
+    """
+    if processes < 0:
+        raise ConfigError(f"processes must be zero or positive, found {processes}")
+    return _solve([problem for problem in problems if problem.index not in done], expert, processes)
+
+
+def _solve(todo: list[Problem], expert: Expert, processes: int) -> Iterator[Demonstration]:
+    if processes == 0:
+        for problem in todo:
+            yield solve_problem(problem, expert)
+        return
+    if not todo:
+        return
+    pool = ProcessPoolExecutor(
+        min(processes, len(todo)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(expert,),
+    )
+    try:
+        waiting = iter(todo)
+        with _one_thread_per_child():  # the first submissions start the processes, which inherit the variables
+            running = {pool.submit(_solve_in_worker, problem) for problem in islice(waiting, 2 * processes)}
+        while running:
+            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                result = future.result()
+                running.update(pool.submit(_solve_in_worker, problem) for problem in islice(waiting, 1))
+                yield result
+    except BrokenProcessPool:
+        raise ResourceError(
+            "a worker process of the expert died (out of memory?); run again to resume, or with fewer processes"
+        ) from None
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _start_worker(expert: Expert) -> None:
+    global _expert
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    _expert = expert
+
+
+def _solve_in_worker(problem: Problem) -> Demonstration:
+    return solve_problem(problem, _expert)
+
+
+@contextmanager
+def _one_thread_per_child() -> Iterator[None]:
+    """Two processes with default threads on two cores run many times slower than with one thread each."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,194 @@
+"""The neural-ODE planner: ``x' = phi(x, t)`` integrated from the start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from sagemp_cli.errors import ConfigError, NonFiniteError
+from sagemp_cli.planners.base import starts_of
+from sagemp_cli.planners.networks import TimeMLP
+from sagemp_cli.planners.neural_ode_loss import NeuralODELoss
+from sagemp_cli.planners.normalizer import Normalizer
+from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.sets import Box
+
+METHODS = ("euler", "rk4")
+
+
+class NeuralODE(nn.Module):
+    """A vector field learned from demonstrations; a reference is its solution from the start.
+
+    The field works on normalised states ``z`` and normalised time ``s = k / K`` in [0, 1]: ``dz/ds = phi(z, s)``.
+    It is deterministic: which side of an obstacle a plan takes follows from the start. Diversity comes from
+    different starts and from a random drift in the integration (``noise``).
+
+    The drift is a stationary Ornstein-Uhlenbeck process, one per state, added to the field: its standard deviation
+    is ``noise`` in state units per second and its correlation time ``noise_time`` in seconds. It is coloured rather
+    than white because white noise that is strong enough to change a plan makes it too jagged to track.
+
+    The network computes in float32. Its rounding is no concern of the proof, which takes a stored reference as
+    exact numbers.
+
+    Args:
+        state_dim: number of states n.
+        horizon: number of steps K.
+        dt: seconds a step.
+        hidden: widths of the hidden layers.
+        frequencies: time features of the network.
+        method: ``"euler"`` (with one substep: the map that the robot's own Euler step has) or ``"rk4"``.
+        substeps: integration steps per reference step.
+        noise: see above, one number or n.
+        noise_time: see above.
+    """
+
+    loss_type: ClassVar = NeuralODELoss
+
+    def __init__(
+        self,
+        *,
+        state_dim: int,
+        horizon: int,
+        dt: float,
+        hidden: list[int],
+        frequencies: int = 3,
+        method: str = "euler",
+        substeps: int = 1,
+        noise: float | Sequence[float] = 0.0,
+        noise_time: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if state_dim < 1 or horizon < 1 or substeps < 1:
+            raise ConfigError(
+                "planner: state_dim, horizon and substeps must be positive, "
+                f"found {state_dim}, {horizon} and {substeps}"
+            )
+        if not 0 < dt < math.inf or not 0 < noise_time < math.inf:
+            raise ConfigError(f"planner: dt and noise_time must be positive seconds, found {dt} and {noise_time}")
+        if method not in METHODS:
+            raise ConfigError(f"planner: method must be one of {METHODS}, found '{method}'")
+        self.state_dim, self.horizon, self.dt = int(state_dim), int(horizon), float(dt)
+        self.hidden, self.frequencies = [int(h) for h in hidden], int(frequencies)
+        self.method, self.substeps, self.noise_time = method, int(substeps), float(noise_time)
+        self.noise = self._per_state(noise)
+        self.normalizer = Normalizer(state_dim)
+        self.field = TimeMLP(state_dim, state_dim, hidden=self.hidden, frequencies=self.frequencies)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Plain keyword arguments that rebuild this planner; its weights are in ``state_dict()``."""
+        return {
+            "state_dim": self.state_dim,
+            "horizon": self.horizon,
+            "dt": self.dt,
+            "hidden": self.hidden,
+            "frequencies": self.frequencies,
+            "method": self.method,
+            "substeps": self.substeps,
+            "noise": self.noise,
+            "noise_time": self.noise_time,
+        }
+
+    def prepare(self, demonstrations: Tensor, *, generator: torch.Generator) -> None:
+        """Fit the normaliser to demonstrations ``(D, K+1, n)`` and draw initial weights."""
+        self.normalizer.fit(demonstrations)
+        self.field.reset(generator)
+
+    def advance(self, z: Tensor, first: int, count: int, *, drift: Tensor | None = None) -> Tensor:
+        """Integrate ``count`` reference steps from step ``first``, differentiably.
+
+        Args:
+            z: normalised states ``(..., n)`` at step ``first``, in the network's dtype.
+            first: index of the step, one number or a batch ``(...)`` as a tensor.
+            count: number of steps.
+            drift: added to the field, constant over a step, ``(count, ..., n)`` in normalised states per unit of
+                normalised time.
+
+        Returns:
+            States at steps ``first + 1 .. first + count``, stacked in a new dimension before the last.
+        """
+        h = 1.0 / (self.horizon * self.substeps)
+        # Times of all stages at once, in half integration steps: [first, first + h/2, first + h, ...].
+        halves = torch.arange(2 * count * self.substeps + 1, dtype=z.dtype) * (0.5 * h)
+        times = self.field.embed(torch.as_tensor(first, dtype=z.dtype)[..., None] / self.horizon + halves)
+        times = times.unbind(-2)
+        states = []
+        for j in range(count):
+            push = None if drift is None else drift[j]
+            for i in range(2 * j * self.substeps, 2 * (j + 1) * self.substeps, 2):
+                slope = self._slope(z, times[i : i + 3], h, push)
+                z = z + h * slope
+            states.append(z)
+        return torch.stack(states, dim=-2)
+
+    def _slope(self, z: Tensor, times: Sequence[Tensor], h: float, push: Tensor | None) -> Tensor:
+        """The mean of field and drift over one integration step, as the method estimates it."""
+
+        def slope(z: Tensor, time: Tensor) -> Tensor:
+            return self.field.at(z, time) if push is None else self.field.at(z, time) + push
+
+        begin, middle, end = times
+        a = slope(z, begin)
+        if self.method == "euler":
+            return a
+        b = slope(z + 0.5 * h * a, middle)
+        c = slope(z + 0.5 * h * b, middle)
+        d = slope(z + h * c, end)
+        return (a + 2 * b + 2 * c + d) / 6
+
+    def forward(self, starts: Tensor, *, drift: Tensor | None = None) -> Tensor:
+        """References ``(..., K+1, n)``, float64, from starts ``(..., n)``; row 0 is the start to the last bit."""
+        starts = starts.to(torch.float64)
+        z = self.advance(self.normalizer.normalize(starts).float(), 0, self.horizon, drift=drift)
+        return torch.cat([starts[..., None, :], self.normalizer.denormalize(z.double())], dim=-2)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        start: Tensor,
+        goal: Box,
+        *,
+        scene: Scene,
+        count: int,
+        generator: torch.Generator,
+        noise: float | Sequence[float] | None = None,
+    ) -> Tensor:
+        """References ``(count, K+1, n)``, see :class:`~sagemp_cli.planners.base.Planner`.
+
+        The field was trained for one scene and goal, so ``goal`` and ``scene`` are not looked at.
+        ``noise`` defaults to what the planner was built with; without any, equal starts give equal references.
+
+        Raises:
+            NonFiniteError: the integration overflowed.
+        """
+        sigma = self.noise if noise is None else self._per_state(noise)
+        starts = starts_of(start, count=count, state_dim=self.state_dim)
+        drift = self._drift(count, sigma, generator) if any(sigma) else None
+        references = self(starts, drift=drift)
+        if not bool(torch.isfinite(references).all()):
+            raise NonFiniteError("planner: a sampled reference contains NaN or infinity; train the planner longer")
+        return references
+
+    def _drift(self, count: int, sigma: Sequence[float], generator: torch.Generator) -> Tensor:
+        """Paths of the drift ``(K, count, n)`` in normalised states per unit of normalised time."""
+        white = torch.randn(self.horizon, count, self.state_dim, generator=generator)
+        keep = math.exp(-self.dt / self.noise_time)
+        value = white[0]
+        path = [value]
+        for xi in white[1:]:
+            value = keep * value + math.sqrt(1 - keep * keep) * xi
+            path.append(value)
+        unit = torch.tensor(sigma, dtype=torch.float64) * self.horizon * self.dt / self.normalizer.scale
+        return torch.stack(path) * unit.float()
+
+    def _per_state(self, value: float | Sequence[float]) -> list[float]:
+        values = [float(v) for v in value] if isinstance(value, Sequence) else [float(value)] * self.state_dim
+        if len(values) != self.state_dim or not all(0 <= v < math.inf for v in values):
+            raise ConfigError(
+                f"planner: noise needs one number or {self.state_dim}, finite and not negative, found {value}"
+            )
+        return values

@@ -1,0 +1,1 @@
+"""Reachability: propagators, relaxations, partitions, verdicts."""

@@ -1,0 +1,137 @@
+"""Forward affine arithmetic: the default propagator.
+
+The set of states at step k is a zonotope ``c_k + G_k [-1, 1]^M``. Each step is evaluated once on affine forms
+(:mod:`sagemp_cli.reachability.affine_form`), which gives the affine inclusion ::
+
+    x_{k+1} in c + J_x (x_k - c_k) + J_w (w_k - c_w) + L [-1, 1]^l + [-e, e]
+
+and with it ``G_{k+1} = [J_x G_k, J_w diag(r_w), L, diag(e)]``. Every error keeps its correlation, which the
+feedback then contracts. Rounding is included (last block), so the tube encloses every real-arithmetic rollout.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.reachability.affine_form import AffineForm, StepFrame
+from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.reduction import reduce_generators
+from sagemp_cli.reachability.relaxations.band import UNIT, Band
+from sagemp_cli.sets import Box, Tube
+
+
+@dataclass(frozen=True)
+class AffineRun:
+    """All that a forward pass found.
+
+    Attributes:
+        tube: bounds per step, ``(*batch, K+1, n)``.
+        bands: per step, the bands used, in the order of evaluation.
+    """
+
+    tube: Tube
+    bands: list[list[tuple[str, Band]]] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Affine:
+    """Forward affine arithmetic, rigorous.
+
+    Attributes:
+        symbols: most generators kept between steps (None: all); the excess is boxed, soundly.
+    """
+
+    symbols: int | None = None
+    name: str = "affine"
+    rigorous: bool = True
+
+    def __post_init__(self) -> None:
+        if self.symbols is not None and self.symbols < 1:
+            raise ConfigError(f"propagator.symbols must be a positive integer or null, found {self.symbols}")
+
+    @torch.no_grad()
+    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
+        return self.run(loop, start, disturbance).tube
+
+    @torch.no_grad()
+    def propagate_with_controls(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor]:
+        """The tube and, per step, bounds of the controls ``(*batch, K, m)`` over it, from the same pass."""
+        watched = _Watched(loop, [])
+        tube = self.propagate(watched, start, disturbance)
+        lower, upper = (torch.stack(side, dim=-2) for side in zip(*watched.controls, strict=True))
+        bad = torch.isnan(lower) | torch.isnan(upper)
+        return tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
+
+    def run(self, loop: Loop, start: Box, disturbance: Box, *, horizon: int | None = None) -> AffineRun:
+        """Propagate and keep the bands (differentiable where autograd is on)."""
+        center, radius = start.center, start.radius
+        generators = torch.diag_embed(radius)
+        reach = radius
+        w_center, w_radius = disturbance.center, disturbance.radius
+        lowers, uppers, bands = [start.lower], [start.upper], []
+        steps = loop.horizon if horizon is None else horizon
+        for k in range(steps):
+            frame = StepFrame(generators, reach, w_radius)
+            after = loop.step(k, frame.state(center), frame.disturbance(w_center))
+            bands.append(frame.bands)
+            center, generators = _advance(after, frame)
+            if self.symbols is not None:
+                generators = reduce_generators(generators, self.symbols)
+            growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
+            reach = generators.abs().sum(-1) * growth
+            spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
+            lowers.append(center - spread)
+            uppers.append(center + spread)
+            if not bool(torch.isfinite(reach).all()):
+                lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
+        return AffineRun(Tube(torch.stack(lowers, -2), torch.stack(uppers, -2)), bands)
+
+
+@dataclass(frozen=True)
+class _Watched:
+    """A closed loop that notes the bounds of its controls as it steps."""
+
+    loop: ClosedLoop
+    controls: list[tuple[Tensor, Tensor]]
+
+    @property
+    def horizon(self) -> int:
+        return self.loop.horizon
+
+    @property
+    def state_dim(self) -> int:
+        return self.loop.state_dim
+
+    def step(self, k: int, x: AffineForm, w: AffineForm) -> AffineForm:
+        u = self.loop.control(k, x)
+        self.controls.append(u.bounds())
+        return self.loop.dynamics.step(x, u, w)
+
+
+def _advance(after: AffineForm, frame: StepFrame) -> tuple[Tensor, Tensor]:
+    """Centre and generators of the next state set from the step's affine form."""
+    rows = after.spread()
+    error = after.magnitude * ((after.error + (2 * frame.states + 16) * UNIT) * (1 + 1e-9))
+    return after.center, torch.cat([rows, torch.diag_embed(error)], dim=-1)
+
+
+def _overflow(lowers, uppers, center, generators, reach):
+    """Give cells that overflowed infinite bounds from here on, and NaN to go on with; other cells are not disturbed."""
+    bad = ~torch.isfinite(reach).all(-1, keepdim=True)
+    lowers[-1] = torch.where(bad, torch.full_like(lowers[-1], -math.inf), lowers[-1])
+    uppers[-1] = torch.where(bad, torch.full_like(uppers[-1], math.inf), uppers[-1])
+    return (
+        lowers,
+        uppers,
+        torch.where(bad, torch.full_like(center, math.nan), center),
+        torch.where(bad[..., None], torch.full_like(generators, math.nan), generators),
+        torch.where(bad, torch.full_like(reach, math.nan), reach),
+    )

@@ -1,0 +1,482 @@
+"""Affine forms: values that answer torch's operations and carry what they depend on.
+
+Within one step of a loop a value is enclosed as ::
+
+    y in c + sum_i coefficient_i z_i + [-e, e],        e = error * magnitude
+
+where the variables ``z`` are, in this order, the deviations of the state from the centre of the current
+state set (a zonotope ``z_x = G eps``), the deviations of the disturbance (a box), and the relaxation errors of
+this step (each in [-1, 1]). Linear operations act on the centre and on the coefficients alike; a nonlinear one
+is replaced by a band and adds one variable per entry.
+
+Rounding. ``magnitude`` obeys the same recurrences with absolute values, ``|c| + sum_i |coefficient_i| |z_i|``;
+then after any sequence of linear operations the accumulated rounding error is at most ``error * magnitude``
+with ``error`` the sum of the unit roundoffs along the longest path (each operation adds its own
+``gamma_k = k u``, Higham 2002, section 3.1). A relaxation absorbs the error of its input in its own radius and
+starts again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
+
+_SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and error factors themselves
+
+
+class StepFrame:
+    """The variables of one step: the state set's generators, the disturbance box, and the relaxation errors so far.
+
+    Attributes:
+        generators: ``G (*batch, n, M)``.
+        reach: an upper bound of ``|z_i|`` for states, ``(*batch, n)``.
+        disturbance_radius: of the disturbance variables, ``(d,)``.
+        size: number of variables so far.
+        bands: bands used in this step, in the order of evaluation (for certificates and the backward pass).
+        slopes: slopes to use instead of the default ones, in the order of evaluation.
+    """
+
+    def __init__(self, generators: Tensor, reach: Tensor, disturbance_radius: Tensor) -> None:
+        self.generators = generators
+        self.reach = reach
+        self.disturbance_radius = disturbance_radius
+        self._own_radius = torch.cat([disturbance_radius, disturbance_radius.new_ones(64)])
+        self.states = generators.shape[-2]
+        self.inputs = self.states + disturbance_radius.shape[-1]
+        self.size = self.inputs
+        self.batch = generators.shape[:-2]
+        self.bands: list[tuple[str, Band]] = []
+        # gamma for sums over all symbols and for the products with the generators
+        self.sum_error = 2 * (generators.shape[-1] + self.states + 64) * UNIT
+
+    def own_radius(self, count: int) -> Tensor:
+        """Radii of the first ``count`` variables after the state: the disturbance's, then ones."""
+        if count > self._own_radius.shape[0]:
+            more = max(count - self._own_radius.shape[0], 64)
+            self._own_radius = torch.cat([self._own_radius, self._own_radius.new_ones(more)])
+        return self._own_radius[:count]
+
+    def state(self, center: Tensor) -> AffineForm:
+        """The current state as a form."""
+        n = self.states
+        unit = center.new_zeros(self.inputs, n)
+        unit[:n].fill_diagonal_(1.0)
+        coefficients = unit.view(self.inputs, *[1] * len(self.batch), n).expand(self.inputs, *self.batch, n)
+        return AffineForm(self, center, coefficients, center.abs() + self.reach + TINY, 0.0)
+
+    def disturbance(self, center: Tensor) -> AffineForm:
+        """The current disturbance as a form."""
+        d = self.inputs - self.states
+        unit = center.new_zeros(self.inputs, d)
+        unit[self.states :].fill_diagonal_(1.0)
+        shape = (*self.batch, d)
+        return AffineForm(
+            self,
+            center.expand(shape),
+            unit.view(self.inputs, *[1] * len(self.batch), d).expand(self.inputs, *shape),
+            (center.abs() + self.disturbance_radius + TINY).expand(shape),
+            0.0,
+        )
+
+
+class AffineForm:
+    """An enclosed value of shape ``shape``; see the module."""
+
+    __slots__ = ("center", "coefficients", "error", "frame", "magnitude")
+
+    def __init__(self, frame: StepFrame, center: Tensor, coefficients: Tensor, magnitude: Tensor, error: float) -> None:
+        self.frame = frame
+        self.center = center
+        self.coefficients = coefficients
+        self.magnitude = magnitude
+        self.error = error
+
+    # -- reading -------------------------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> torch.Size:
+        """Shape, batch first."""
+        return self.center.shape
+
+    def dim(self) -> int:
+        """Number of dimensions."""
+        return self.center.dim()
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Always float64."""
+        return self.center.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the tensors."""
+        return self.center.device
+
+    def spread(self) -> Tensor:
+        """Rows ``(*batch, events, symbols)`` of the form in terms of all symbols in [-1, 1] (without the error part).
+
+        The entries carry a relative rounding that :meth:`radius` accounts for.
+        """
+        frame, rows = self.frame, self._rows()
+        n = frame.states
+        own = rows[..., n:] * frame.own_radius(rows.shape[-1] - n)
+        return torch.cat([rows[..., :n] @ frame.generators, own], dim=-1)
+
+    def _rows(self) -> Tensor:
+        """Coefficients as ``(*batch, events, variables)``."""
+        coefficients, batch = self.coefficients, self.frame.batch
+        if coefficients.dim() != len(batch) + 2:
+            coefficients = coefficients.reshape(coefficients.shape[0], *batch, -1)
+        return coefficients.movedim(0, -1)
+
+    def slack(self) -> Tensor:
+        """Upper bound of the rounding error carried, plus that of summing up a radius and of one subtraction."""
+        return self.magnitude * ((self.error + self.frame.sum_error) * _SAFETY)
+
+    def radius(self) -> Tensor:
+        """An upper bound of ``|y - c|``, rounding included, such that ``c - r`` and ``c + r`` as rounded are bounds."""
+        frame = self.frame
+        rows = self._rows()
+        n = frame.states
+        own = rows[..., n:].abs() @ frame.own_radius(rows.shape[-1] - n)
+        total = (rows[..., :n] @ frame.generators).abs().sum(-1) + own
+        return total.reshape(self.shape) + self.slack()
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bound of the value."""
+        r = self.radius()
+        return self.center - r, self.center + r
+
+    # -- building ------------------------------------------------------------------------------------------------
+
+    def _linear(
+        self, map_: Callable[[Tensor], Tensor], coefficient_map: Callable[[Tensor], Tensor] | None = None
+    ) -> AffineForm:
+        """A form under a map that only moves entries (exact)."""
+        return AffineForm(
+            self.frame,
+            map_(self.center),
+            (coefficient_map or map_)(self.coefficients),
+            map_(self.magnitude),
+            self.error,
+        )
+
+    def relaxed(self, name: str, band: Band) -> AffineForm:
+        """The form of ``f(self)`` for a band of f over :meth:`bounds`."""
+        frame = self.frame
+        slope, offset, radius = band
+        carried = slope.abs() * self.magnitude
+        magnitude = carried + offset.abs() + radius + TINY
+        radius = radius * _SAFETY + carried * (self.error * _SAFETY) + magnitude * (4 * UNIT)
+        frame.bands.append((name, band))
+        return self._with_fresh(self.center * slope + offset, self.coefficients * slope, magnitude, radius)
+
+    def _with_fresh(self, center: Tensor, coefficients: Tensor, magnitude: Tensor, radius: Tensor) -> AffineForm:
+        """Append one new variable per entry with the given radius."""
+        frame = self.frame
+        flat = radius.reshape(*frame.batch, -1)
+        fresh = torch.diag_embed(flat).movedim(-1, 0).reshape(flat.shape[-1], *center.shape)
+        gap = frame.size - coefficients.shape[0]
+        parts = [coefficients, fresh] if gap == 0 else [coefficients, center.new_zeros(gap, *center.shape), fresh]
+        frame.size += flat.shape[-1]
+        return AffineForm(frame, center, torch.cat(parts), magnitude + radius, 4 * UNIT)
+
+    # -- operators -----------------------------------------------------------------------------------------------
+
+    def __add__(self, other: Any) -> AffineForm:
+        return add(self, other)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> AffineForm:
+        return AffineForm(self.frame, -self.center, -self.coefficients, self.magnitude, self.error)
+
+    def __sub__(self, other: Any) -> AffineForm:
+        return add(self, -other)
+
+    def __rsub__(self, other: Any) -> AffineForm:
+        return add(-self, other)
+
+    def __mul__(self, other: Any) -> AffineForm:
+        return multiply(self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> AffineForm:
+        return torch.div(self, other)
+
+    def __rtruediv__(self, other: Any) -> AffineForm:
+        return torch.div(other, self)
+
+    def __pow__(self, exponent: Any) -> AffineForm:
+        return torch.pow(self, exponent)
+
+    def __matmul__(self, other: Any) -> AffineForm:
+        return torch.matmul(self, other)
+
+    def __getitem__(self, index: Any) -> AffineForm:
+        index = index if isinstance(index, tuple) else (index,)
+        return self._linear(lambda t: t[index], lambda t: t[(slice(None), *index)])
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(torch.Tensor, name, None)
+        if method is None or name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *args, **kwargs: _dispatch(method, (self, *args), kwargs)
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Callable[..., Any], types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        return _dispatch(function, args, kwargs or {})
+
+
+HANDLERS: dict[Any, Callable[..., Any]] = {}
+"""Torch function to its implementation on forms; one line per function."""
+
+
+def handles(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register an implementation for torch functions or methods."""
+
+    def register(implementation: Callable[..., Any]) -> Callable[..., Any]:
+        for f in functions:
+            HANDLERS[f] = implementation
+        return implementation
+
+    return register
+
+
+def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    handler = HANDLERS.get(function)
+    if handler is None:
+        name = getattr(function, "__name__", str(function))
+        raise UnsupportedOperationError(
+            f"torch operation '{name}' has no relaxation in the affine propagator; "
+            f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
+        )
+    return handler(*args, **kwargs)
+
+
+def _frame_of(*values: Any) -> StepFrame:
+    return next(v.frame for v in values if isinstance(v, AffineForm))
+
+
+def constant(frame: StepFrame, value: Any, like: Tensor) -> Tensor:
+    """A number or tensor as float64 tensor."""
+    return torch.as_tensor(value, dtype=torch.float64, device=like.device)
+
+
+def _broadcast(a: torch.Size, b: torch.Size) -> torch.Size:
+    """Shape of a broadcast (the common case first: torch's own function is slow)."""
+    return a if a == b or not b else torch.broadcast_shapes(a, b)
+
+
+def _expand(form: AffineForm, shape: torch.Size, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, coefficients (padded with zeros to ``size`` variables) and magnitude, broadcast to ``shape``."""
+    coefficients = form.coefficients
+    if coefficients.shape[0] == size and form.center.shape == shape:
+        return form.center, coefficients, form.magnitude
+    missing = len(shape) - (coefficients.dim() - 1)
+    if missing:
+        coefficients = coefficients.reshape(coefficients.shape[0], *[1] * missing, *coefficients.shape[1:])
+    if coefficients.shape[1:] != shape:
+        coefficients = coefficients.expand(coefficients.shape[0], *shape)
+    gap = size - coefficients.shape[0]
+    if gap:
+        coefficients = torch.cat([coefficients, coefficients.new_zeros(gap, *shape)])
+    return form.center.expand(shape), coefficients, form.magnitude.expand(shape)
+
+
+@handles(torch.add, torch.Tensor.add, torch.Tensor.__add__, torch.Tensor.__radd__)
+def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
+    """Sum of forms and constants."""
+    if alpha != 1:
+        b = multiply(b, alpha) if isinstance(b, AffineForm) else b * alpha
+    if not isinstance(a, AffineForm):
+        a, b = b, a
+    if not isinstance(b, AffineForm):
+        value = constant(a.frame, b, a.center)
+        shape = _broadcast(a.shape, value.shape)
+        center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
+        return AffineForm(a.frame, center + value, coefficients, magnitude + value.abs(), a.error + UNIT)
+    shape = _broadcast(a.shape, b.shape)
+    size = max(a.coefficients.shape[0], b.coefficients.shape[0])
+    (c1, g1, m1), (c2, g2, m2) = _expand(a, shape, size), _expand(b, shape, size)
+    return AffineForm(a.frame, c1 + c2, g1 + g2, m1 + m2, max(a.error, b.error) + UNIT)
+
+
+@handles(torch.sub, torch.Tensor.sub, torch.Tensor.__sub__)
+def subtract(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
+    """Difference."""
+    return add(a, multiply(b, -alpha) if isinstance(b, AffineForm) else -torch.as_tensor(b) * alpha)
+
+
+@handles(torch.rsub, torch.Tensor.__rsub__)
+def reverse_subtract(a: Any, b: Any) -> AffineForm:
+    """``b - a``."""
+    return subtract(b, a)
+
+
+@handles(torch.neg, torch.Tensor.neg, torch.Tensor.__neg__)
+def negate(a: AffineForm) -> AffineForm:
+    """Negation (exact)."""
+    return -a
+
+
+@handles(torch.mul, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
+def multiply(a: Any, b: Any) -> AffineForm:
+    """Product with a constant, or of two forms."""
+    if not isinstance(a, AffineForm):
+        a, b = b, a
+    if isinstance(b, AffineForm):
+        return _product(a, b)
+    if isinstance(b, (int, float)):
+        if b == 1:
+            return a
+        b = float(b)
+        return AffineForm(a.frame, a.center * b, a.coefficients * b, a.magnitude * abs(b) + TINY, a.error + UNIT)
+    value = constant(a.frame, b, a.center)
+    shape = _broadcast(a.shape, value.shape)
+    center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
+    return AffineForm(a.frame, center * value, coefficients * value, magnitude * value.abs() + TINY, a.error + UNIT)
+
+
+@handles(torch.div, torch.Tensor.div, torch.true_divide, torch.Tensor.__truediv__)
+def divide(a: Any, b: Any) -> AffineForm:
+    """Quotient with a constant denominator, else the product with the reciprocal."""
+    if isinstance(b, AffineForm):
+        return multiply(torch.reciprocal(b), a)
+    value = constant(a.frame, b, a.center)
+    shape = _broadcast(a.shape, value.shape)
+    center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
+    return AffineForm(a.frame, center / value, coefficients / value, magnitude / value.abs() + TINY, a.error + 2 * UNIT)
+
+
+def _product(a: AffineForm, b: AffineForm) -> AffineForm:
+    """Product of two forms whose deviations may be correlated.
+
+    ``(c + X)(d + Y) = c d + c Y + d X + X Y`` and, with ``P = l X + Y / l`` and ``M = l X - Y / l`` for any l > 0,
+    ``X Y = (P^2 - M^2) / 4`` lies in ``[-r_M^2 / 4, r_P^2 / 4]``: equal to the usual ``r_X r_Y`` for independent
+    operands, up to half as wide for correlated ones (exact for a square). l is a power of two near
+    ``sqrt(r_Y / r_X)``, so scaling is exact.
+    """
+    frame = a.frame
+    shape = _broadcast(a.shape, b.shape)
+    size = max(a.coefficients.shape[0], b.coefficients.shape[0])
+    (c, gx, mx), (d, gy, my) = _expand(a, shape, size), _expand(b, shape, size)
+    x = AffineForm(frame, c, gx, mx, a.error)
+    y = AffineForm(frame, d, gy, my, b.error)
+    rows_x, rows_y = x.spread(), y.spread()
+    slack_x, slack_y = x.slack(), y.slack()
+    radius_x = rows_x.abs().sum(-1).reshape(shape) + slack_x
+    radius_y = rows_y.abs().sum(-1).reshape(shape) + slack_y
+    with torch.no_grad():
+        ratio = ((radius_y + TINY) / (radius_x + TINY)).log2().mul_(0.5).round_().clamp_(-200, 200).exp2_()
+    scale = ratio.reshape(rows_x.shape[:-1])[..., None]
+    scaled_x, scaled_y = rows_x * scale, rows_y / scale
+    slack = (slack_x * ratio + slack_y / ratio) * (1 + 4 * UNIT)
+    plus = (scaled_x + scaled_y).abs().sum(-1).reshape(shape) + slack
+    minus = (scaled_x - scaled_y).abs().sum(-1).reshape(shape) + slack
+    high, low = plus * plus * 0.25, minus * minus * 0.25
+    middle, half = 0.5 * (high - low), 0.5 * (high + low)
+    magnitude = c.abs() * my + d.abs() * mx + c.abs() * d.abs() + half + TINY
+    radius = half * _SAFETY + magnitude * ((max(a.error, b.error) + 8 * UNIT) * _SAFETY)
+    frame.bands.append(("product", Band(ratio, middle, radius)))
+    return x._with_fresh(c * d + middle, c * gy + d * gx, magnitude, radius)
+
+
+@handles(torch.nn.functional.linear)
+def linear(x: AffineForm, weight: Tensor, bias: Tensor | None = None) -> AffineForm:
+    """``x W^T + b``; one matrix product each for centre, coefficients and magnitude."""
+    apply = torch.nn.functional.linear
+    magnitude = apply(x.magnitude, weight.abs()) + (TINY if bias is None else bias.abs() + TINY)
+    error = x.error + (weight.shape[-1] + 2) * UNIT
+    return AffineForm(x.frame, apply(x.center, weight, bias), apply(x.coefficients, weight), magnitude, error)
+
+
+@handles(torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__)
+def matrix_product(x: Any, y: Any) -> AffineForm:
+    """``x @ W`` for a constant matrix."""
+    if isinstance(y, AffineForm) or y.dim() != 2:
+        raise UnsupportedOperationError("torch.matmul is supported as x @ W with a constant two-dimensional W")
+    return linear(x, y.transpose(0, 1))
+
+
+@handles(torch.sum, torch.Tensor.sum)
+def total(x: AffineForm, dim: int, keepdim: bool = False) -> AffineForm:
+    """Sum over one event dimension."""
+    count = x.shape[dim]
+    moved = x._linear(lambda t: t.sum(_from_end(dim, x), keepdim))
+    return AffineForm(x.frame, moved.center, moved.coefficients, moved.magnitude, x.error + count * UNIT)
+
+
+def _from_end(dim: int, x: AffineForm) -> int:
+    """A dimension counted from the end, which is the same for values and for coefficients."""
+    return dim if dim < 0 else dim - x.dim()
+
+
+@handles(torch.stack)
+def stack(values: Sequence[Any], dim: int = 0) -> AffineForm:
+    """Stack forms and constants."""
+    return _joined(torch.stack, values, dim if dim < 0 else dim - 1 - max(v.dim() for v in values))
+
+
+@handles(torch.cat, torch.concat, torch.concatenate)
+def cat(values: Sequence[Any], dim: int = 0) -> AffineForm:
+    """Concatenate forms and constants."""
+    return _joined(torch.cat, values, dim if dim < 0 else dim - max(v.dim() for v in values))
+
+
+def _joined(join: Callable[..., Tensor], values: Sequence[Any], dim: int) -> AffineForm:
+    frame = _frame_of(*values)
+    size = max(v.coefficients.shape[0] for v in values if isinstance(v, AffineForm))
+    error = max(v.error for v in values if isinstance(v, AffineForm))
+    parts = []
+    for v in values:
+        if isinstance(v, AffineForm):
+            shape = torch.Size((*frame.batch, *v.shape[len(frame.batch) :])) if v.dim() >= len(frame.batch) else v.shape
+            parts.append(_expand(v, shape, size))
+        else:
+            value = torch.as_tensor(v, dtype=torch.float64)
+            extra = value.dim() - (max(w.dim() for w in values) - len(frame.batch))
+            if extra <= 0 and len(frame.batch):
+                value = value.expand(*frame.batch, *value.shape)
+            parts.append((value, value.new_zeros(size, *value.shape), value.abs()))
+    centers, coefficients, magnitudes = zip(*parts, strict=True)
+    return AffineForm(frame, join(centers, dim), join(coefficients, dim), join(magnitudes, dim), error)
+
+
+@handles(torch.unbind, torch.Tensor.unbind)
+def unbind(x: AffineForm, dim: int = 0) -> tuple[AffineForm, ...]:
+    """Slices along one dimension."""
+    d = _from_end(dim, x)
+    return tuple(
+        AffineForm(x.frame, c, g, m, x.error)
+        for c, g, m in zip(x.center.unbind(d), x.coefficients.unbind(d), x.magnitude.unbind(d), strict=True)
+    )
+
+
+@handles(torch.flatten, torch.Tensor.flatten)
+def flatten(x: AffineForm, start_dim: int = 0, end_dim: int = -1) -> AffineForm:
+    """Merge event dimensions."""
+    a, b = _from_end(start_dim, x), _from_end(end_dim, x)
+    return x._linear(lambda t: t.flatten(a, b))
+
+
+@handles(torch.unsqueeze, torch.Tensor.unsqueeze)
+def unsqueeze(x: AffineForm, dim: int) -> AffineForm:
+    """Insert a dimension."""
+    d = dim if dim < 0 else dim - x.dim() - 1
+    return x._linear(lambda t: t.unsqueeze(d))
+
+
+@handles(torch.squeeze, torch.Tensor.squeeze)
+def squeeze(x: AffineForm, dim: int) -> AffineForm:
+    """Remove a dimension of size one."""
+    return x._linear(lambda t: t.squeeze(_from_end(dim, x)))

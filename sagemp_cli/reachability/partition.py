@@ -1,0 +1,83 @@
+"""Partitions of a start box: how many cells along which dimension, and the cells."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.sets import Box
+
+_PRODUCT = re.compile(r"^\d+(x\d+)*$")
+
+
+def parse_partitions(value: Any, uncertain_dims: int) -> list[int]:
+    """Cells per uncertain start dimension, from what a user writes.
+
+    Args:
+        value: the number of cells in all (``4``), which is factored as evenly as possible, larger factors first
+            (4 over two dimensions is 2 x 2, 6 is 3 x 2, 5 is 5 x 1), or counts per uncertain dimension
+            (``"2x2"`` or ``[2, 2]``).
+        uncertain_dims: number of start dimensions of positive width.
+
+    Raises:
+        ConfigError: anything else, e.g. 0 or "4x".
+    """
+    allowed = (
+        f"a positive number of cells in all, or {uncertain_dims} counts such as {'x'.join(['2'] * uncertain_dims)}"
+    )
+    counts: list[int] = []
+    if isinstance(value, str) and _PRODUCT.match(value.strip()):
+        counts = [int(part) for part in value.strip().split("x")]
+    elif isinstance(value, int) and not isinstance(value, bool):
+        counts = [value]
+    elif isinstance(value, Sequence) and all(isinstance(v, int) and not isinstance(v, bool) for v in value):
+        counts = list(value)
+    if not counts or min(counts) < 1:
+        raise ConfigError(f"partitions must be {allowed}; found {value!r}")
+    if len(counts) == 1 and isinstance(value, int | str):
+        return _even_factors(counts[0], uncertain_dims)
+    if len(counts) != uncertain_dims:
+        raise ConfigError(f"partitions must be {allowed}; found {len(counts)} counts in {value!r}")
+    return counts
+
+
+def _even_factors(cells: int, dims: int) -> list[int]:
+    """``dims`` factors of ``cells`` whose largest is as small as can be, in descending order."""
+    if dims == 1:
+        return [cells]
+    small = [d for d in range(1, math.isqrt(cells) + 1) if cells % d == 0]
+    divisors = {*small, *(cells // d for d in small)}
+    return min(sorted([d, *_even_factors(cells // d, dims - 1)], reverse=True) for d in divisors)
+
+
+def partition(start: Box, counts: Sequence[int]) -> Box:
+    """Uniform cells ``(..., C, n)`` that cover the start boxes ``(..., n)`` without gaps.
+
+    Args:
+        start: one box, or a batch of boxes that are uncertain in the same dimensions.
+        counts: cells per uncertain dimension (positive width), in order; their product is C.
+    """
+    uncertain = uncertain_dimensions(start)
+    if len(counts) != len(uncertain):
+        raise ConfigError(
+            f"partition needs one count for each of {len(uncertain)} uncertain dimensions, found {counts}"
+        )
+    full = [1] * start.dim
+    for dimension, count in zip(uncertain, counts, strict=True):
+        full[dimension] = int(count)
+    flat_lower, flat_upper = start.lower.reshape(-1, start.dim), start.upper.reshape(-1, start.dim)
+    cells = [Box(low, high).split(full) for low, high in zip(flat_lower, flat_upper, strict=True)]
+    shape = (*start.lower.shape[:-1], -1, start.dim)
+    return Box(
+        torch.stack([c.lower for c in cells]).reshape(shape), torch.stack([c.upper for c in cells]).reshape(shape)
+    )
+
+
+def uncertain_dimensions(start: Box) -> list[int]:
+    """Dimensions of positive width in any of the boxes ``(..., n)``."""
+    return torch.nonzero((start.width > 0).reshape(-1, start.dim).any(0)).flatten().tolist()

@@ -1,0 +1,1 @@
+"""Relaxations, one file per operation: the tightest band that contains a function's graph, rounding included."""

@@ -1,0 +1,1 @@
+"""Figures: one file each; they read artifacts and nothing else."""

@@ -1,0 +1,190 @@
+"""What all figures share: one palette, one type size, scenes drawn to scale, states over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from sagemp_cli.binding import build
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.scenes import Ball, Scene, scene_from_mapping
+from sagemp_cli.sets import Box
+
+INK = "#1f2a37"
+MUTED = "#6b7785"
+HAIRLINE = "#dfe4ea"
+OBSTACLE = "#566273"
+GOAL = "#2b9348"
+REFERENCE = "#111827"
+SAFE = "#1d7f45"
+UNKNOWN = "#b86e00"
+DANGER = "#c81e3a"
+MODES = ("#2a6fbb", "#d9730d", "#7b4fb5", "#00838f", "#a8415b", "#5d7c15")
+"""Colours of distinct things without order: sides, references, library entries."""
+TIME = LinearSegmentedColormap.from_list("time", ["#8fd3e8", "#3f8fc6", "#3a55a4", "#5a2a82", "#2d0f4f"])
+"""Light to dark with time."""
+VERDICT_COLOURS = {
+    "SAFE": SAFE,
+    "VERIFIED": SAFE,
+    "UNSAFE": DANGER,
+    "FALSIFIED": DANGER,
+    "MAY_COLLIDE": UNKNOWN,
+    "MISSES_GOAL": UNKNOWN,
+    "UNBOUNDED": UNKNOWN,
+    "UNKNOWN": UNKNOWN,
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Robot, scene and start box of an artifact, built from the config that it carries."""
+
+    dynamics: Dynamics
+    scene: Scene
+    start: Box
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Setting:
+        """From an artifact's config."""
+        dynamics = build(config["dynamics"], "dynamics")
+        n, d = dynamics.state_dim, len(dynamics.position)
+        scene = scene_from_mapping(config["scene"], state_dim=n, position_dim=d)
+        return cls(dynamics, scene, Box.around(config["start"]["center"], config["start"]["radius"]))
+
+    @property
+    def plane(self) -> list[int]:
+        """The two states that a map of the workspace shows: the first two of the position."""
+        return list(self.dynamics.position[:2])
+
+    def label(self, state: int) -> str:
+        """Axis label of a state, with its unit."""
+        return f"{self.dynamics.state_names[state]} ({self.dynamics.state_units[state]})"
+
+
+def blank_figure(width: float, height: float) -> Figure:
+    """A white figure of the given size in inches."""
+    return Figure(figsize=(width, height), dpi=150, facecolor="white", layout="constrained")
+
+
+def headline(figure: Figure, text: str, subtitle: str, *, colour: str = INK) -> None:
+    """Two lines at the top left: what the figure says, and under which conditions."""
+    figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.62 / figure.get_figheight()))
+    top = 1 - 0.12 / figure.get_figheight()
+    figure.text(0.012, top, text, ha="left", va="top", fontsize=14, fontweight="bold", color=colour)
+    figure.text(
+        0.012, top - 0.27 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9.5, color=MUTED
+    )
+
+
+def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "") -> None:
+    """Quiet axes: hairline grid below the data, no box."""
+    axes.set_axisbelow(True)
+    axes.grid(color=HAIRLINE, linewidth=0.6)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelsize=8.5, length=3)
+    axes.set_xlabel(xlabel, fontsize=9.5, color=INK)
+    axes.set_ylabel(ylabel, fontsize=9.5, color=INK)
+    if title:
+        axes.set_title(title, fontsize=10, color=INK, loc="left")
+
+
+def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
+    """Workspace, obstacles and goal to scale; a three-dimensional scene is seen from above."""
+    scene, (i, j) = setting.scene, setting.plane
+    low, high = scene.workspace.lower.tolist(), scene.workspace.upper.tolist()
+    style_axes(axes, xlabel=setting.label(i), ylabel=setting.label(j))
+    axes.set_aspect("equal")
+    pad = 0.015 * max(high[0] - low[0], high[1] - low[1])
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(low[1] - pad, high[1] + pad)
+    axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.4, zorder=1))
+    for obstacle in scene.obstacles:
+        if isinstance(obstacle, Ball):
+            center = obstacle.center[:2]
+            axes.add_patch(Circle(center, obstacle.radius, facecolor=OBSTACLE, edgecolor="none", zorder=2))
+        else:
+            center = [0.5 * (a + b) for a, b in zip(obstacle.lower[:2], obstacle.upper[:2], strict=True)]
+            axes.add_patch(_box(obstacle.lower, obstacle.upper, facecolor=OBSTACLE, edgecolor="none", zorder=2))
+        if names:
+            axes.annotate(obstacle.name, center, ha="center", va="center", fontsize=7.5, color="white", zorder=2.5)
+    goal_low = np.maximum([scene.goal.lower[i], scene.goal.lower[j]], low[:2])
+    goal_high = np.minimum([scene.goal.upper[i], scene.goal.upper[j]], high[:2])
+    axes.add_patch(_box(goal_low, goal_high, facecolor=GOAL, alpha=0.16, edgecolor="none", zorder=1.5))
+    axes.add_patch(_box(goal_low, goal_high, fill=False, edgecolor=GOAL, linewidth=1.6, zorder=6))
+    if names:
+        at = (0.5 * (goal_low[0] + goal_high[0]), goal_high[1])
+        axes.annotate(
+            "goal", at, (0, 4), textcoords="offset points", ha="center", fontsize=8.5, color=GOAL, fontweight="bold"
+        )
+
+
+def draw_start(axes: Axes, setting: Setting) -> None:
+    """The outline of X_I."""
+    low, high = setting.start.lower[setting.plane].tolist(), setting.start.upper[setting.plane].tolist()
+    axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)), zorder=5))
+    at = (low[0], high[1])
+    axes.annotate("X$_I$", at, (2, 3), textcoords="offset points", fontsize=9, color=INK)
+
+
+def draw_paths(axes: Axes, paths: np.ndarray, **options: Any) -> None:
+    """Many paths ``(count, K+1, 2)`` as one collection."""
+    axes.add_collection(LineCollection(list(np.asarray(paths)), **({"capstyle": "round", "zorder": 3} | options)))
+
+
+def draw_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, **options: Any) -> None:
+    """Boxes ``(count, 2)`` as one collection; infinite ones are left out."""
+    finite = np.isfinite(lower).all(-1) & np.isfinite(upper).all(-1)
+    patches = [_box(a, b) for a, b in zip(lower[finite], upper[finite], strict=True)]
+    options = {k: v[finite] if isinstance(v, np.ndarray) and len(v) == len(finite) else v for k, v in options.items()}
+    axes.add_collection(PatchCollection(patches, **options))
+
+
+def tube_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3) -> None:
+    """A tube's cross-sections ``(K+1, 2)`` over the plane, coloured by time, the latest in front."""
+    shade = TIME(np.linspace(0, 1, len(lower)))
+    draw_boxes(axes, lower, upper, facecolors=shade, edgecolors="none", alpha=alpha, zorder=3)
+    draw_boxes(axes, lower, upper, facecolors="none", edgecolors=shade, linewidths=0.35, alpha=0.75, zorder=3.1)
+
+
+def time_bar(figure: Figure, axes: Axes | Sequence[Axes], seconds: float) -> None:
+    """The colour scale of :data:`TIME`."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(0, seconds), TIME), ax=axes, orientation="horizontal", fraction=0.035, pad=0.02, aspect=45
+    )
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(colors=MUTED, labelsize=8.5, length=3)
+    bar.set_label("time (s)", fontsize=9.5, color=INK)
+
+
+def goal_at_end(axes: Axes, setting: Setting, state: int, end: float) -> None:
+    """The goal's faces in one state as a bracket at the end of the time axis."""
+    low, high = float(setting.scene.goal.lower[state]), float(setting.scene.goal.upper[state])
+    if np.isfinite(low) or np.isfinite(high):
+        bottom, top = axes.get_ylim()
+        low, high = max(low, bottom), min(high, top)
+        axes.plot([end, end], [low, high], color=GOAL, linewidth=4, solid_capstyle="butt", zorder=6, clip_on=False)
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend without a box around it."""
+    axes.legend(**({"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.6} | options))
+
+
+def _box(lower: Sequence[float], upper: Sequence[float], **options: Any) -> Rectangle:
+    return Rectangle(
+        (float(lower[0]), float(lower[1])), float(upper[0] - lower[0]), float(upper[1] - lower[1]), **options
+    )

@@ -1,0 +1,152 @@
+"""Figure: what was proved. The tube in the workspace, every state over time, the clearance at every step."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from sagemp_cli.report.canvas import (
+    DANGER,
+    INK,
+    MODES,
+    MUTED,
+    REFERENCE,
+    VERDICT_COLOURS,
+    Setting,
+    blank_figure,
+    draw_boxes,
+    draw_paths,
+    draw_scene,
+    goal_at_end,
+    headline,
+    legend,
+    style_axes,
+    time_bar,
+    tube_boxes,
+)
+from sagemp_cli.sets import Box
+from sagemp_cli.storage import Artifact, Certificate, Tubes
+
+_SAYS = {
+    "VERIFIED": "Certified: every start in X$_I$ stays clear and reaches the goal",
+    "FALSIFIED": "Falsified: a replayed counterexample breaks the claim",
+    "UNKNOWN": "Unknown: the tube does not prove it, and no counterexample was found",
+}
+
+
+def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
+    """Tube to scale on the left; states with their bounds, and the certified clearance, over time on the right."""
+    record, setting = artifact.record, Setting.of(artifact.header.config)
+    tubes, dynamics = record.tubes, setting.dynamics
+    count, horizon = len(tubes.references), tubes.references.shape[1] - 1
+    shown = list(range(dynamics.state_dim))
+    rows = len(shown) + 1
+    figure = blank_figure(14, max(5.6, 1.28 * rows))
+    grid = figure.add_gridspec(rows, 2, width_ratios=(2.05, 1))
+
+    scene = figure.add_subplot(grid[:, 0])
+    draw_scene(scene, setting)
+    for r in range(count):
+        draw_tube(scene, setting, tubes, r)
+    for example in record.counterexamples:
+        path = example.states[:, setting.plane]
+        draw_paths(scene, path[None], colors=DANGER, linewidths=1.6, zorder=8)
+        scene.scatter(*path[example.step], s=46, marker="X", color=DANGER, edgecolor="white", linewidth=0.6, zorder=9)
+    handles = [
+        Line2D([], [], color=REFERENCE, lw=1.2, ls=(0, (4, 2)), label="reference"),
+        Line2D([], [], color=INK, lw=0.9, marker="s", mfc="none", ms=7, ls="", label="start cells"),
+    ]
+    if record.counterexamples:
+        handles.append(Line2D([], [], color=DANGER, lw=1.6, marker="X", label="counterexample"))
+    legend(scene, handles=handles, loc="lower left", ncols=3)
+    time_bar(figure, scene, horizon * dynamics.dt)
+
+    times, first = dynamics.dt * np.arange(horizon + 1), None
+    for row, state in enumerate(shown):
+        axes = figure.add_subplot(grid[row, 1], sharex=first)
+        first = first or axes
+        style_axes(axes, ylabel=setting.label(state))
+        axes.tick_params(labelbottom=False)
+        for r in range(count):
+            _band(axes, times, tubes, r, state)
+        for example in record.counterexamples:
+            axes.plot(times, example.states[:, state], color=DANGER, linewidth=1.2, zorder=8)
+        goal_at_end(axes, setting, state, times[-1])
+    axes = figure.add_subplot(grid[-1, 1], sharex=first)
+    _clearances(axes, times, setting, tubes)
+    axes.set_xlim(0, times[-1])
+
+    cells = len(tubes.cell_reference)
+    proof = "rounding included" if tubes.rigorous else "sound in exact arithmetic"
+    headline(
+        figure,
+        f"{_SAYS.get(record.verdict, record.verdict)}",
+        f"{artifact.header.experiment}: {_deciding(tubes)}; {count} reference{'s' * (count > 1)}, "
+        f"{cells} cell{'s' * (cells > 1)}, K = {horizon} ({horizon * dynamics.dt:g} s), "
+        f"{tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; "
+        f"{record.falsifier_rollouts} rollouts attacked it",
+        colour=VERDICT_COLOURS.get(record.verdict, INK),
+    )
+    return figure
+
+
+def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alpha: float = 0.3) -> None:
+    """One reference in the workspace: cross-sections of its cells' tubes, its start cells, and itself."""
+    mine, plane = tubes.cell_reference == reference, setting.plane
+    lower, upper = tubes.tube_lower[mine][..., plane], tubes.tube_upper[mine][..., plane]
+    alpha = alpha / np.sqrt(max(1, len(lower) / 4))
+    for low, high in zip(lower, upper, strict=True):
+        tube_boxes(axes, low, high, alpha=alpha)
+    draw_boxes(
+        axes,
+        tubes.cell_lower[mine][:, plane],
+        tubes.cell_upper[mine][:, plane],
+        facecolors="none",
+        edgecolors=INK,
+        linewidths=0.9,
+        zorder=5,
+    )
+    path = tubes.references[reference][:, plane]
+    axes.plot(*path.T, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=7)
+
+
+def _band(axes: Axes, times: np.ndarray, tubes: Tubes, reference: int, state: int) -> None:
+    mine, colour = tubes.cell_reference == reference, MODES[reference % len(MODES)]
+    lower, upper = tubes.tube_lower[mine][..., state], tubes.tube_upper[mine][..., state]
+    finite = np.isfinite(lower).all(0) & np.isfinite(upper).all(0)
+    for low, high in zip(lower, upper, strict=True):
+        axes.fill_between(times[finite], low[finite], high[finite], color=colour, alpha=0.15, linewidth=0)
+    axes.plot(times[finite], lower.min(0)[finite], color=colour, linewidth=0.9)
+    axes.plot(times[finite], upper.max(0)[finite], color=colour, linewidth=0.9)
+    axes.plot(times, tubes.references[reference, :, state], color=REFERENCE, linewidth=1.0, linestyle=(0, (4, 2)))
+
+
+def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -> None:
+    """Certified distance of the tubes to every constraint; below the red line nothing is proved."""
+    index = list(setting.dynamics.position)
+    lower, upper = tubes.tube_lower[..., index], tubes.tube_upper[..., index]
+    lower = np.nan_to_num(lower, nan=-np.inf, posinf=-np.inf)
+    upper = np.nan_to_num(upper, nan=np.inf, neginf=np.inf)
+    found = setting.scene.clearances(Box(torch.from_numpy(lower), torch.from_numpy(upper))).amin(0).numpy()
+    style_axes(axes, xlabel="time (s)", ylabel="clearance (m)")
+    for i, name in enumerate(tubes.constraint_names):
+        colour = MUTED if i == 0 else MODES[(i - 1) % len(MODES)]
+        axes.plot(times, found[:, i], color=colour, linewidth=1.3, label=name)
+    finite = found[np.isfinite(found)]
+    bottom = min(0.0, float(finite.min())) if len(finite) else 0.0
+    axes.axhline(0, color=DANGER, linewidth=1.1)
+    axes.set_ylim(max(-1.0, bottom) - 0.1, 3.0)
+    legend(axes, loc="upper right", ncols=len(tubes.constraint_names), fontsize=7.5)
+
+
+def _deciding(tubes: Tubes) -> str:
+    """The verdict of the worst reference, in words."""
+    open_ones = [r for r, v in enumerate(tubes.verdict) if v != "SAFE"]
+    if open_ones:
+        r = open_ones[0]
+        return f"{tubes.verdict[r]} at step {tubes.step[r]} ({tubes.constraint[r]})"
+    r, c = np.unravel_index(tubes.clearance.argmin(), tubes.clearance.shape)
+    return f"SAFE, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"

@@ -1,0 +1,80 @@
+"""Figure: the library. Certified references with their tubes, and what was rejected and why."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from sagemp_cli.report.canvas import (
+    DANGER,
+    INK,
+    MODES,
+    MUTED,
+    SAFE,
+    UNKNOWN,
+    Setting,
+    blank_figure,
+    draw_boxes,
+    draw_paths,
+    draw_scene,
+    draw_start,
+    headline,
+    legend,
+    style_axes,
+)
+from sagemp_cli.storage import Artifact, Library
+
+
+def draw_library(artifact: Artifact[Library]) -> Figure:
+    """Tubes and references on the left, the account of all samples on the right."""
+    record, setting = artifact.record, Setting.of(artifact.header.config)
+    tubes, plane = record.tubes, setting.plane
+    count, horizon = len(tubes.references), tubes.references.shape[1] - 1
+    figure = blank_figure(13, 5.4)
+    grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1))
+
+    scene = figure.add_subplot(grid[0])
+    draw_scene(scene, setting)
+    draw_start(scene, setting)
+    early = np.array([r.startswith("reference") for r in record.rejected_reason], dtype=bool)
+    for mask, colour in ((early, DANGER), (~early, UNKNOWN)):
+        draw_paths(
+            scene, record.rejected_references[mask][..., plane], colors=colour, linewidths=0.7, alpha=0.4, zorder=2.8
+        )
+    for r in range(count):
+        mine, colour = tubes.cell_reference == r, MODES[r % len(MODES)]
+        lower, upper = tubes.tube_lower[mine].min(0)[:, plane], tubes.tube_upper[mine].max(0)[:, plane]
+        draw_boxes(scene, lower, upper, facecolors=colour, edgecolors="none", alpha=0.09, zorder=3)
+        draw_boxes(scene, lower, upper, facecolors="none", edgecolors=colour, linewidths=0.4, alpha=0.55, zorder=3.1)
+        scene.plot(*tubes.references[r][:, plane].T, color=colour, linewidth=1.6, zorder=7)
+    handles = [Line2D([], [], color=MODES[0], lw=2, label="certified, with tube")]
+    if early.any():
+        handles.append(Line2D([], [], color=DANGER, lw=2, label="reference rejected"))
+    if (~early).any():
+        handles.append(Line2D([], [], color=UNKNOWN, lw=2, label="tube rejected"))
+    legend(scene, handles=handles, loc="lower left", ncols=3)
+
+    axes = figure.add_subplot(grid[1])
+    names = ["certified", *record.reason_names]
+    values = [count, *record.reason_counts.tolist()]
+    colours = [SAFE, *(DANGER if name.startswith("reference") else UNKNOWN for name in record.reason_names)]
+    style_axes(axes, xlabel="references sampled")
+    axes.barh(range(len(names)), values, color=colours, height=0.62)
+    axes.set_yticks(range(len(names)), names, fontsize=9, color=INK)
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    for i, value in enumerate(values):
+        axes.annotate(str(value), (value, i), (4, 0), textcoords="offset points", va="center", fontsize=9, color=MUTED)
+    axes.set_xlim(0, 1.15 * max(values))
+    headline(
+        figure,
+        f"Library of {count} certified reference{'s' * (count > 1)}"
+        + (f" ({record.wanted} wanted)" if count < record.wanted else ""),
+        f"{artifact.header.experiment}: {record.sampled} references sampled, "
+        f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, {tubes.propagator} in {tubes.seconds.sum():.2g} s; "
+        f"smallest certified clearance {tubes.clearance.min():.2f} m",
+        colour=SAFE if count >= record.wanted else INK,
+    )
+    return figure

@@ -1,0 +1,87 @@
+"""Figure: executions of Algorithm 3 against the certified tubes."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from sagemp_cli.report.canvas import (
+    DANGER,
+    MODES,
+    MUTED,
+    SAFE,
+    Setting,
+    blank_figure,
+    draw_boxes,
+    draw_paths,
+    draw_scene,
+    draw_start,
+    goal_at_end,
+    headline,
+    legend,
+    style_axes,
+)
+from sagemp_cli.storage import Artifact, Library, Rollouts
+
+DRAWN = 600
+"""Rollouts drawn at most, evenly spaced; those that left their tube are always drawn."""
+
+
+def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> Figure:
+    """Rollouts to scale over the tubes of the references that were tracked; every state over time beside them."""
+    record, setting = artifact.record, Setting.of(artifact.header.config)
+    dynamics, tubes, plane = setting.dynamics, library.record.tubes, setting.plane
+    total, horizon = len(record.states), record.states.shape[1] - 1
+    chosen = record.chosen[record.query]
+    some = np.unique(np.linspace(0, total - 1, min(DRAWN, total)).astype(int))
+    alpha = float(np.clip(6 / np.sqrt(len(some)) / 3, 0.08, 0.6))
+
+    figure = blank_figure(14, max(5.4, 1.35 * dynamics.state_dim))
+    grid = figure.add_gridspec(dynamics.state_dim, 2, width_ratios=(2.05, 1))
+    scene = figure.add_subplot(grid[:, 0])
+    draw_scene(scene, setting)
+    draw_start(scene, setting)
+    panels, times = [], dynamics.dt * np.arange(horizon + 1)
+    for i in range(dynamics.state_dim):
+        axes = figure.add_subplot(grid[i, 1], sharex=panels[0] if panels else None)
+        style_axes(axes, ylabel=setting.label(i))
+        axes.tick_params(labelbottom=i == dynamics.state_dim - 1)
+        panels.append(axes)
+    for r in np.unique(chosen):
+        mine, colour = tubes.cell_reference == r, MODES[r % len(MODES)]
+        lower, upper = tubes.tube_lower[mine].min(0), tubes.tube_upper[mine].max(0)
+        draw_boxes(scene, lower[:, plane], upper[:, plane], facecolors=colour, edgecolors="none", alpha=0.07, zorder=2.7)
+        draw_paths(
+            scene, record.states[some[chosen[some] == r]][..., plane], colors=colour, linewidths=0.5, alpha=alpha, zorder=4
+        )
+        for i, axes in enumerate(panels):
+            axes.fill_between(times, lower[:, i], upper[:, i], color=colour, alpha=0.12, linewidth=0)
+            curves = record.states[some[chosen[some] == r]][..., i]
+            lines = np.stack([np.broadcast_to(times, curves.shape), curves], axis=-1)
+            draw_paths(axes, lines, colors=colour, linewidths=0.4, alpha=alpha)
+    escaped = record.states[~record.in_tube]
+    draw_paths(scene, escaped[..., plane], colors=DANGER, linewidths=1.2, zorder=8)
+    draw_paths(scene, record.sampled_references[..., plane], colors=MUTED, linewidths=0.6, linestyles=(0, (4, 3)), zorder=3.5)
+    for i, axes in enumerate(panels):
+        axes.autoscale_view()
+        axes.set_xlim(0, times[-1])
+        goal_at_end(axes, setting, i, times[-1])
+    panels[-1].set_xlabel("time (s)", fontsize=9.5)
+    handles = [
+        Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks reference {i}") for i in np.unique(chosen)
+    ]
+    handles.append(Line2D([], [], color=MUTED, lw=1, ls=(0, (4, 3)), label="planner's proposal"))
+    legend(scene, handles=handles, loc="lower left", ncols=min(3, len(handles)))
+
+    inside, safe = int(record.in_tube.sum()), int(record.safe.sum())
+    text = "All" if inside == total else f"Only {inside} of"
+    headline(
+        figure,
+        f"{text} {total} rollouts stayed in their tube",
+        f"{artifact.header.experiment}: {len(record.chosen)} starts measured in X$_I$, closest of {len(tubes.references)} certified "
+        f"references tracked (mean E = {record.reference_error.mean():.3g}); random and worst-case disturbances; "
+        f"{safe} of {total} kept clear and reached the goal",
+        colour=SAFE if inside == total else DANGER,
+    )
+    return figure

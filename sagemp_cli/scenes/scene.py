@@ -1,0 +1,149 @@
+"""Workspace, obstacles and goal: the safe set of the paper, with exact or outward-rounded box tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.sets import Box, round_down
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A disc (2-D) or sphere (3-D): ``|p - center|_2 <= radius`` is occupied. Closed form, never a polygon."""
+
+    center: tuple[float, ...]
+    radius: float
+    name: str = "ball"
+
+    def signed_distance(self, p: Tensor) -> Tensor:
+        """Distance of points ``(..., d)`` to the surface, negative inside (round to nearest)."""
+        return torch.linalg.vector_norm(p - torch.tensor(self.center, dtype=p.dtype), dim=-1) - self.radius
+
+    def clearance(self, box: Box) -> Tensor:
+        """A lower bound on the distance between boxes ``(..., d)`` and the ball, rounded down; <= 0 may touch.
+
+        Distance to the nearest point of the box (Arvo's test), each operation rounded towards zero.
+        """
+        c = torch.tensor(self.center, dtype=torch.float64)
+        gap = round_down(torch.maximum(box.lower - c, c - box.upper)).clamp(min=0.0)
+        square = round_down(gap * gap).clamp(min=0.0)
+        total = square[..., 0]
+        for i in range(1, square.shape[-1]):
+            total = round_down(total + square[..., i]).clamp(min=0.0)
+        return round_down(round_down(torch.sqrt(total)).clamp(min=0.0) - self.radius)
+
+
+@dataclass(frozen=True)
+class Block:
+    """An axis-aligned rectangle or cuboid ``lower <= p <= upper``."""
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    name: str = "block"
+
+    def signed_distance(self, p: Tensor) -> Tensor:
+        """Distance of points ``(..., d)`` to the surface, negative inside (round to nearest)."""
+        low, high = (torch.tensor(v, dtype=p.dtype) for v in (self.lower, self.upper))
+        gap = torch.maximum(low - p, p - high)
+        return torch.linalg.vector_norm(gap.clamp(min=0.0), dim=-1) + gap.amax(-1).clamp(max=0.0)
+
+    def clearance(self, box: Box) -> Tensor:
+        """A lower bound on the largest per-axis gap between boxes and the block, rounded down; <= 0 may touch."""
+        low, high = (torch.tensor(v, dtype=torch.float64) for v in (self.lower, self.upper))
+        return round_down(torch.maximum(low - box.upper, box.lower - high).amax(-1))
+
+
+Obstacle = Ball | Block
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The safe set ``S`` (workspace minus obstacles, over positions) and the goal ``X_G`` (over states).
+
+    Attributes:
+        workspace: box of allowed positions, ``(d,)``.
+        obstacles: occupied sets over positions.
+        goal: box over the whole state ``(n,)``; dimensions that do not matter are infinite.
+    """
+
+    workspace: Box
+    obstacles: tuple[Obstacle, ...]
+    goal: Box
+
+    def signed_distance(self, p: Tensor) -> Tensor:
+        """Smallest distance of points ``(..., d)`` to any obstacle or the workspace's outside, negative if unsafe."""
+        inside = torch.minimum(p - self.workspace.lower.to(p), self.workspace.upper.to(p) - p).amin(-1)
+        return torch.stack([inside, *(o.signed_distance(p) for o in self.obstacles)], dim=-1).amin(-1)
+
+    def clearances(self, box: Box) -> Tensor:
+        """Lower bounds on the clearance of position boxes ``(..., d)``: last dimension is [workspace, obstacles...].
+
+        A value > 0 proves that the box keeps clear (for the workspace: >= 0 would do; strict is used for both).
+        """
+        inside = round_down(torch.minimum(box.lower - self.workspace.lower, self.workspace.upper - box.upper).amin(-1))
+        return torch.stack([inside, *(o.clearance(box) for o in self.obstacles)], dim=-1)
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names along the last dimension of :meth:`clearances`."""
+        return ("workspace", *(o.name for o in self.obstacles))
+
+
+def _numbers(where: str, values: Any, size: int | None = None) -> tuple[float, ...]:
+    if not isinstance(values, Sequence) or isinstance(values, str):
+        raise ConfigError(f"{where} must be a list of numbers, found {values!r}")
+    try:
+        out = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{where} must be a list of numbers, found {list(values)!r}") from None
+    if size is not None and len(out) != size:
+        raise ConfigError(f"{where} needs {size} numbers, found {len(out)}")
+    if any(v != v for v in out):
+        raise ConfigError(f"{where} contains NaN")
+    return out
+
+
+def scene_from_mapping(data: Mapping[str, Any], *, state_dim: int, position_dim: int) -> Scene:
+    """Build a scene from plain config data; every complaint names the key.
+
+    Keys: ``workspace {lower, upper}``, ``obstacles`` (a list of ``{kind: ball, center, radius, name}`` or
+    ``{kind: block, lower, upper, name}``) and ``goal {lower, upper}`` over the state (``-inf``/``inf`` allowed).
+    """
+    for key in data:
+        if key not in ("workspace", "obstacles", "goal", "name", "description"):
+            raise ConfigError(f"scene: unknown key '{key}'{did_you_mean(key, ('workspace', 'obstacles', 'goal'))}")
+    for key in ("workspace", "obstacles", "goal"):
+        if key not in data:
+            raise ConfigError(f"scene: key '{key}' is missing")
+
+    def box(key: str, size: int) -> Box:
+        part = data[key]
+        return Box(
+            torch.tensor(_numbers(f"scene.{key}.lower", part.get("lower"), size), dtype=torch.float64),
+            torch.tensor(_numbers(f"scene.{key}.upper", part.get("upper"), size), dtype=torch.float64),
+        )
+
+    obstacles: list[Obstacle] = []
+    for i, item in enumerate(data["obstacles"]):
+        where, kind = f"scene.obstacles[{i}]", item.get("kind")
+        name = str(item.get("name", f"obstacle {i}"))
+        if kind == "ball":
+            radius = float(item.get("radius", -1.0))
+            if not 0 < radius < float("inf"):
+                raise ConfigError(f"{where}.radius must be a positive number, found {item.get('radius')!r}")
+            obstacles.append(Ball(_numbers(f"{where}.center", item.get("center"), position_dim), radius, name))
+        elif kind == "block":
+            low = _numbers(f"{where}.lower", item.get("lower"), position_dim)
+            high = _numbers(f"{where}.upper", item.get("upper"), position_dim)
+            if any(a >= b for a, b in zip(low, high, strict=True)):
+                raise ConfigError(f"{where}: lower must lie below upper")
+            obstacles.append(Block(low, high, name))
+        else:
+            raise ConfigError(f"{where}.kind must be 'ball' or 'block', found {kind!r}")
+    return Scene(box("workspace", position_dim), tuple(obstacles), box("goal", state_dim))

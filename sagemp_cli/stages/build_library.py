@@ -1,0 +1,89 @@
+"""``sagemp build-library``: Algorithm 2, references sampled until enough are certified."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from sagemp_cli.binding import build
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.library import REASONS, build_library
+from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
+from sagemp_cli.reachability.refutation import attack
+from sagemp_cli.reachability.verification import verify_references
+from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.report.library import draw_library
+from sagemp_cli.sets import Box
+from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.tubes import tubes_record
+from sagemp_cli.storage import Library
+
+
+def run(context: StageContext) -> Path:
+    """Sample, reject or certify, attack what was certified, write the library."""
+    problem, section = problem_of(context.config), context.config["library"]
+    wanted = whole_number(section["size"], "library.size")
+    budget = whole_number(section["budget"], "library.budget", least=wanted)
+    spread = section["start_spread"]
+    if not isinstance(spread, int | float) or not 0 <= spread <= 1:
+        raise ConfigError(f"library.start_spread must be a share of X_I in [0, 1], found {spread!r}")
+    counts = parse_partitions(context.config["verify"]["partitions"], len(uncertain_dimensions(problem.start)))
+    propagator = build(context.config["propagator"], "propagator")
+    planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
+    planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
+
+    generator = context.generator("build-library: references")
+    center = problem.start.center
+    starts = Box(center + spread * (problem.start.lower - center), center + spread * (problem.start.upper - center))
+
+    def draw(count: int) -> Tensor:
+        return planner.sample(
+            starts.sample(count, generator), problem.scene.goal, scene=problem.scene, count=count, generator=generator
+        )
+
+    made = build_library(
+        draw,
+        lambda references: verify_references(
+            propagator,
+            problem.dynamics,
+            tracker=tracker,
+            scene=problem.scene,
+            references=references,
+            start=problem.start,
+            disturbance=problem.disturbance,
+            counts=counts,
+        ),
+        scene=problem.scene,
+        position=problem.dynamics.position,
+        wanted=wanted,
+        budget=budget,
+        progress=context.progress,
+    )
+    attack(
+        made.certified,
+        problem.dynamics,
+        tracker=tracker,
+        scene=problem.scene,
+        generator=context.generator("build-library: falsifier"),
+        progress=context.progress,
+    )
+    record = Library(
+        tubes=tubes_record(made.certified),
+        tracker=tracker_file.record.weights,
+        tracker_arguments=tracker_file.record.arguments,
+        rejected_references=made.rejected.numpy(),
+        rejected_reason=made.reasons,
+        reason_names=REASONS,
+        reason_counts=np.array(made.counts, dtype=np.int64),
+        sampled=made.sampled,
+        wanted=wanted,
+    )
+    path = context.write("build-library", record, (planner_file, tracker_file))
+    draw_beside(path, draw_library, context.read("build-library"))
+    return path

@@ -1,0 +1,209 @@
+"""What a stage is: which files it reads, which file it writes, which config keys its output depends on.
+
+A stage opens artifacts, builds objects from config, calls the core and writes one file; the mathematics is
+elsewhere. The table :data:`STAGES` is all that ``run``, ``status`` and the commands know about them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.storage import (
+    Artifact,
+    Certificate,
+    Demonstrations,
+    Header,
+    Library,
+    PlannerModel,
+    Rollouts,
+    TrackerModel,
+    read_artifact,
+    refuse_existing,
+    sha256_of,
+    write_artifact,
+)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline.
+
+    Attributes:
+        name: the command.
+        output: file name of what it writes, in the experiment's folder.
+        record: record class of that file.
+        inputs: names of the stages whose outputs it reads.
+        sections: dotted config keys that its output depends on, beyond those of its inputs.
+    """
+
+    name: str
+    output: str
+    record: type
+    inputs: tuple[str, ...]
+    sections: tuple[str, ...]
+
+    @property
+    def role(self) -> str:
+        """Name of the output among the parents of another artifact."""
+        return self.output.removesuffix(".h5")
+
+    def run(self, context: StageContext) -> Path:
+        """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote."""
+        refuse_existing(context.output_path(self.name), context.overwrite)
+        return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}").run(context)
+
+
+_ROBOT = ("name", "dynamics", "scene", "horizon")
+
+STAGES = (
+    Stage("gen-data", "demonstrations.h5", Demonstrations, (), (*_ROBOT, "expert", "start", "seed")),
+    Stage("train-planner", "planner.h5", PlannerModel, ("gen-data",), (*_ROBOT, "planner", "planner_training", "seed")),
+    Stage(
+        "train-tracker",
+        "tracker.h5",
+        TrackerModel,
+        ("train-planner",),
+        (*_ROBOT, "tracker", "training", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "verify",
+        "certificate.h5",
+        Certificate,
+        ("train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", "verify", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "build-library",
+        "library.h5",
+        Library,
+        ("train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", "verify.partitions", "library", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "execute",
+        "rollouts.h5",
+        Rollouts,
+        ("train-planner", "train-tracker", "build-library"),
+        (*_ROBOT, "execute", "start", "disturbance", "seed"),
+    ),
+)
+
+
+def stage_named(name: str) -> Stage:
+    """The stage of a command."""
+    return next(s for s in STAGES if s.name == name)
+
+
+def section(config: Mapping[str, Any], dotted: str) -> Any:
+    """The value of a dotted key, None where it is absent."""
+    node: Any = config
+    for part in dotted.split("."):
+        node = node.get(part) if isinstance(node, Mapping) else None
+    return node
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What a stage is told: the config, where to read and write, and how to report.
+
+    Attributes:
+        config: resolved config.
+        folder: folder of the experiment's artifacts.
+        overwrite: whether an existing output may be replaced.
+        progress: where to report to.
+        started: for the seconds in the header.
+    """
+
+    config: Mapping[str, Any]
+    folder: Path
+    overwrite: bool = False
+    progress: Progress = field(default_factory=Silent)
+    started: float = field(default_factory=time.monotonic)
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], **options: Any) -> StageContext:
+        """The context of a config: its folder is ``<artifacts>/<name><effort.suffix>``."""
+        return cls(config, Path(config["artifacts"]) / f"{config['name']}{config['effort']['suffix']}", **options)
+
+    @property
+    def seed(self) -> int:
+        """Root seed."""
+        return int(self.config["seed"])
+
+    def generator(self, purpose: str) -> torch.Generator:
+        """A random generator that depends on the root seed and the purpose only."""
+        digest = hashlib.sha256(f"{self.seed}/{purpose}".encode()).digest()
+        return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+
+    def output_path(self, stage: str) -> Path:
+        """Where a stage's output is."""
+        return self.folder / stage_named(stage).output
+
+    def partial_folder(self, stage: str) -> Path:
+        """Where a long stage keeps finished pieces until its output is written."""
+        return self.folder / f".{stage_named(stage).role}.partial"
+
+    def read(self, stage: str) -> Artifact[Any]:
+        """Read another stage's output and check that it fits this config and its own parents.
+
+        Raises:
+            ArtifactError: missing (names the command that makes it), of another experiment, robot or dt,
+                or made from a parent that has changed since.
+        """
+        made_by, path = stage_named(stage), self.output_path(stage)
+        if not path.exists():
+            raise ArtifactError(
+                f"{path}: missing; make it with 'sagemp {stage} experiment={self.config['name']}'"
+                f" (or 'sagemp run', which makes everything that is missing)"
+            )
+        artifact = read_artifact(path, made_by.record)
+        for key in made_by.sections:
+            found, wanted = section(artifact.header.config, key), section(self.config, key)
+            if found != wanted:
+                where, a, b = first_difference(key, found, wanted)
+                raise ArtifactError(
+                    f"{path}: was made with {where}={a}, this config says {b}; "
+                    f"remake it with 'sagemp {stage} --overwrite' or drop the override"
+                )
+        for parent in artifact.header.parents:
+            source = self.folder / parent.path
+            if not source.exists():
+                continue  # an input that is gone cannot contradict what was made from it
+            if sha256_of(source) != parent.sha256:
+                raise ArtifactError(
+                    f"{path}: was made from an earlier {source}, which has changed since; "
+                    f"remake it with 'sagemp {stage} --overwrite'"
+                )
+        return artifact
+
+    def write(self, stage: str, record: Any, parents: tuple[Artifact[Any], ...] = ()) -> Path:
+        """Write a stage's output with its provenance."""
+        header = Header(
+            stage=stage,
+            experiment=str(self.config["name"]),
+            config=self.config,
+            seed=self.seed,
+            parents=tuple(p.as_parent(p.path.stem, self.folder) for p in parents),
+            seconds=time.monotonic() - self.started,
+            device=str(self.config["device"]),
+        )
+        return write_artifact(self.output_path(stage), record, header, overwrite=self.overwrite)
+
+
+def first_difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
+    """The first dotted key at which two config values differ, with both values."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for k in [*wanted, *(k for k in found if k not in wanted)]:
+            if found.get(k) != wanted.get(k):
+                return first_difference(f"{key}.{k}", found.get(k), wanted.get(k))
+    return key, found, wanted

@@ -1,0 +1,74 @@
+"""``sagemp train-tracker``: one tracking policy for all references of the planner."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sagemp_cli.binding import build
+from sagemp_cli.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
+from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.report.training import draw_training
+from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.partial import PartialFile
+from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.storage import TrackerModel
+from sagemp_cli.trackers.losses import LossWeights
+from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.trackers.training import train_tracker
+from sagemp_cli.trackers.tube_loss import TubeLoss
+
+
+def run(context: StageContext) -> Path:
+    """Train on references of the planner, starts and disturbances of the sets that will be verified."""
+    problem, section = problem_of(context.config), dict(context.config["training"])
+    count = whole_number(section.pop("references", None), "training.references")
+    tube = section.pop("tube", None)
+    if tube is not None:
+        tube = TubeLoss(**options_for(TubeLoss, tube, "training.tube"))
+    given = ("tracker", "dynamics", "start", "disturbance", "generator", "tube", "checkpoint", "identity", "progress")
+    options = options_for(train_tracker, section, "training", given=(*given, "references"))
+    options_for(LossWeights, options.get("weights"), "training.weights")
+    extra = data_arguments(context.config["tracker"], "tracker", problem.dynamics, problem.horizon)
+    arguments = {key: value for key, value in context.config["tracker"].items() if key != "_target_"} | extra
+    with torch.random.fork_rng(devices=[]):  # initial weights depend on the root seed, whatever was drawn before
+        torch.manual_seed(context.generator("train-tracker: initial weights").initial_seed())
+        tracker: Tracker = build(context.config["tracker"], "tracker", **extra)
+    planner_file = context.read("train-planner")
+    planner = planner_from(planner_file)
+
+    drawing = context.generator("train-tracker: references")
+    references = planner.sample(
+        problem.start.sample(count, drawing), problem.scene.goal, scene=problem.scene, count=count, generator=drawing
+    )
+    partial = PartialFile.of(context, "train-tracker", parents=(planner_file.as_parent("planner", context.folder),))
+    history = train_tracker(
+        tracker,
+        problem.dynamics,
+        references=references,
+        start=problem.start,
+        disturbance=problem.disturbance,
+        generator=context.generator("train-tracker"),
+        tube=tube,
+        checkpoint=partial.path,
+        identity=partial.identity,
+        progress=context.progress,
+        **options,
+    )
+    figures = figures_at_end(history)
+    record = TrackerModel(
+        weights=weights_of(tracker),
+        arguments=json.dumps(arguments),
+        curve=curve_of(history),
+        figure_names=tuple(figures),
+        figures=np.array(list(figures.values())),
+    )
+    path = context.write("train-tracker", record, (planner_file,))
+    partial.remove()
+    draw_beside(path, draw_training, context.read("train-tracker"))
+    return path
+

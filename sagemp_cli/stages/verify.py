@@ -1,0 +1,90 @@
+"""``sagemp verify``: references of the planner, their tubes, the verdict, and an attack on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sagemp_cli.binding import build
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.reachability.falsifier import Counterexample as Found
+from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
+from sagemp_cli.reachability.refutation import attack
+from sagemp_cli.reachability.verdict import answer_of
+from sagemp_cli.reachability.verification import verify_references
+from sagemp_cli.report.certificate import draw_certificate
+from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.tubes import tubes_record
+from sagemp_cli.storage import Certificate, Counterexample
+
+
+def run(context: StageContext) -> Path:
+    """Sample references at x_I, prove what can be proved, try to refute the rest."""
+    problem, section = problem_of(context.config), context.config["verify"]
+    counts = parse_partitions(section["partitions"], len(uncertain_dimensions(problem.start)))
+    count = whole_number(section["references"], "verify.references")
+    search = section.get("falsifier") or {}
+    given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
+    search = options_for(attack, search, "verify.falsifier", given=given)
+    for key, value in search.items():
+        whole_number(value, f"verify.falsifier.{key}", least=1 if key == "at_once" else 0)
+    propagator = build(context.config["propagator"], "propagator")
+    planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
+    planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
+
+    references = planner.sample(
+        problem.start.center,
+        problem.scene.goal,
+        scene=problem.scene,
+        count=count,
+        generator=context.generator("verify: references"),
+    )
+    if references.shape[1] != problem.horizon + 1:
+        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {references.shape[1] - 1} steps")
+    verification = verify_references(
+        propagator,
+        problem.dynamics,
+        tracker=tracker,
+        scene=problem.scene,
+        references=references,
+        start=problem.start,
+        disturbance=problem.disturbance,
+        counts=counts,
+        progress=context.progress,
+    )
+    refutation = attack(
+        verification,
+        problem.dynamics,
+        tracker=tracker,
+        scene=problem.scene,
+        generator=context.generator("verify: falsifier"),
+        progress=context.progress,
+        **search,
+    )
+    record = Certificate(
+        tubes=tubes_record(refutation.verification),
+        tracker=tracker_file.record.weights,
+        tracker_arguments=tracker_file.record.arguments,
+        counterexamples=tuple(_counterexample(r, found) for r, found in refutation.counterexamples),
+        falsifier_rollouts=refutation.rollouts,
+        verdict=str(answer_of(refutation.verification.verdicts)),
+    )
+    path = context.write("verify", record, (planner_file, tracker_file))
+    draw_beside(path, draw_certificate, context.read("verify"))
+    return path
+
+
+def _counterexample(reference: int, found: Found) -> Counterexample:
+    """As stored; an obstacle is a 'collision' there."""
+    return Counterexample(
+        reference=reference,
+        kind="collision" if found.kind == "obstacle" else found.kind,
+        step=found.step,
+        constraint=found.name,
+        depth=found.depth,
+        states=found.states.numpy(),
+        disturbances=found.disturbances.numpy(),
+    )

@@ -1,0 +1,175 @@
+"""The kinds of artifact: one record class each. ``docs/artifacts.md`` describes them in prose.
+
+Dimensions: ``count`` demonstrations or references, ``K`` steps, ``n`` states, ``m`` controls, ``cells`` of all
+partitions together, ``rollouts`` simulated runs. Arrays are time first after the count. Numbers are finite but
+where ``finite=False`` says otherwise: bounds that overflowed are infinite, figures that were not measured NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sagemp_cli.storage.record import array, group, scalar, texts, weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demonstrations:
+    """Expert trajectories of trajectory optimisation, exactly feasible (made by ``gen-data``)."""
+
+    states: np.ndarray = array("count K+1 n", "states of the rollout of the stored controls")
+    controls: np.ndarray = array("count K m", "controls")
+    problem: np.ndarray = array("count", "index of the problem; one problem may have several solutions", dtype="int64")
+    side: tuple[str, ...] = texts("count", "side on which each obstacle is passed, e.g. 'LR'")
+    cost: np.ndarray = array("count", "optimised cost")
+    optimality: np.ndarray = array("count", "norm of the projected gradient of the problem at the solution")
+    control_violation: np.ndarray = array("count", "largest excess over a control limit")
+    state_violation: np.ndarray = array("count", "largest excess over a state limit")
+    clearance: np.ndarray = array("count", "smallest signed distance to obstacles and workspace", units="m")
+    goal_error: np.ndarray = array("count", "distance of the final position from the goal's centre", units="m")
+    iterations: np.ndarray = array("count", "solver iterations", dtype="int64")
+    seconds: np.ndarray = array("count", "solver time", units="s")
+    failed: tuple[str, ...] = texts("failures", "one line for each problem that was not solved: index and reason")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingCurve:
+    """Losses over training steps."""
+
+    step: np.ndarray = array("points", "training step", dtype="int64")
+    names: tuple[str, ...] = texts("figures", "names of the figures")
+    values: np.ndarray = array("points figures", "figures; NaN where one was not measured at that step", finite=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerModel:
+    """A trained generative planner (made by ``train-planner``); built from the config's ``planner`` section."""
+
+    weights: dict[str, np.ndarray] = weights("parameters and buffers")
+    arguments: str = scalar("constructor arguments that came from the data, as JSON")
+    curve: TrainingCurve = group(TrainingCurve, "training and validation curve")
+    figure_names: tuple[str, ...] = texts("report", "model card: names of the figures")
+    figures: np.ndarray = array("report", "model card: values, e.g. open-loop safety rate", finite=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackerModel:
+    """A trained tracking policy (made by ``train-tracker``)."""
+
+    weights: dict[str, np.ndarray] = weights("parameters and buffers")
+    arguments: str = scalar("constructor arguments, as JSON")
+    curve: TrainingCurve = group(TrainingCurve, "training curve")
+    figure_names: tuple[str, ...] = texts("report", "model card: names of the figures")
+    figures: np.ndarray = array("report", "model card: values, e.g. tracking error", finite=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tubes:
+    """References, their tubes and the verdicts (the body of ``verify``'s certificate and of a library)."""
+
+    references: np.ndarray = array("count K+1 n", "references from the planner, fixed in the proof")
+    start_lower: np.ndarray = array("count n", "lower corner of X_I")
+    start_upper: np.ndarray = array("count n", "upper corner of X_I")
+    disturbance_lower: np.ndarray = array("d", "lower corner of W")
+    disturbance_upper: np.ndarray = array("d", "upper corner of W")
+    cell_reference: np.ndarray = array("cells", "index of the reference that each cell belongs to", dtype="int64")
+    cell_lower: np.ndarray = array("cells n", "lower corners of the partition's cells")
+    cell_upper: np.ndarray = array("cells n", "upper corners of the partition's cells")
+    tube_lower: np.ndarray = array("cells K+1 n", "lower bounds of the reach set of each cell and step", finite=False)
+    tube_upper: np.ndarray = array("cells K+1 n", "upper bounds of the reach set of each cell and step", finite=False)
+    control_lower: np.ndarray = array("count K m", "lower bounds of the controls over all cells", finite=False)
+    control_upper: np.ndarray = array("count K m", "upper bounds of the controls over all cells", finite=False)
+    verdict: tuple[str, ...] = texts("count", "SAFE, MAY_COLLIDE, MISSES_GOAL, UNBOUNDED or UNSAFE")
+    step: np.ndarray = array("count", "step that decided the verdict (-1: none, SAFE)", dtype="int64")
+    constraint: tuple[str, ...] = texts("count", "obstacle, workspace or goal dimension that decided ('' if SAFE)")
+    constraint_names: tuple[str, ...] = texts("constraints", "names of the constraints of 'clearance'")
+    clearance: np.ndarray = array(
+        "count constraints", "smallest certified distance to each constraint", units="m", finite=False
+    )
+    goal_margin: np.ndarray = array(
+        "count n", "distance of the tube at K from the goal's faces (negative: outside)", finite=False
+    )
+    seconds: np.ndarray = array("count", "share of the proof time", units="s")
+    propagator: str = scalar("propagator that made the tubes")
+    rigorous: bool = scalar("whether rounding is included in the tubes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counterexample:
+    """A replayed rollout that violates the claim."""
+
+    reference: int = scalar("index of the reference")
+    kind: str = scalar("'collision', 'workspace' or 'goal'")
+    step: int = scalar("step of the violation")
+    constraint: str = scalar("obstacle, 'workspace' or goal dimension")
+    depth: float = scalar("depth of the violation (> 0)")
+    states: np.ndarray = array("K+1 n", "replayed states")
+    disturbances: np.ndarray = array("K n", "disturbances")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certificate:
+    """What ``verify`` proved, with everything that the proof speaks about."""
+
+    tubes: Tubes = group(Tubes, "references, cells, tubes and verdicts")
+    tracker: dict[str, np.ndarray] = weights("tracker weights, exact")
+    tracker_arguments: str = scalar("tracker constructor arguments, as JSON")
+    counterexamples: tuple[Counterexample, ...] = group(Counterexample, "replayed counterexamples", many=True)
+    falsifier_rollouts: int = scalar("rollouts that the falsifier tried")
+    verdict: str = scalar("VERIFIED, FALSIFIED or UNKNOWN for all references together")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Library:
+    """Certified references (Algorithm 2, made by ``build-library``)."""
+
+    tubes: Tubes = group(Tubes, "the certified references only")
+    tracker: dict[str, np.ndarray] = weights("tracker weights, exact")
+    tracker_arguments: str = scalar("tracker constructor arguments, as JSON")
+    rejected_references: np.ndarray = array("rejected K+1 n", "references that were not certified", finite=False)
+    rejected_reason: tuple[str, ...] = texts("rejected", "why each was rejected")
+    reason_names: tuple[str, ...] = texts("reasons", "reasons of rejection")
+    reason_counts: np.ndarray = array("reasons", "how often each occurred", dtype="int64")
+    sampled: int = scalar("references sampled altogether")
+    wanted: int = scalar("certified references asked for, C")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """Executions of Algorithm 3 (made by ``execute``)."""
+
+    sampled_references: np.ndarray = array("queries K+1 n", "what the planner proposed at run time")
+    chosen: np.ndarray = array("queries", "index of the closest certified reference in the library", dtype="int64")
+    reference_error: np.ndarray = array("queries", "distance E_tau of the paper's equation 10 to the chosen one")
+    query: np.ndarray = array("rollouts", "query that each rollout belongs to", dtype="int64")
+    states: np.ndarray = array("rollouts K+1 n", "executed states")
+    controls: np.ndarray = array("rollouts K m", "executed controls")
+    disturbances: np.ndarray = array("rollouts K n", "disturbances")
+    in_tube: np.ndarray = array("rollouts", "whether the whole rollout stayed in its tube", dtype="bool")
+    safe: np.ndarray = array("rollouts", "whether it stayed in the safe set and reached the goal", dtype="bool")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Name and format version of a record class."""
+
+    name: str
+    version: int
+    record: type
+
+
+KINDS = (
+    Kind("demonstrations", 1, Demonstrations),
+    Kind("planner", 1, PlannerModel),
+    Kind("tracker", 1, TrackerModel),
+    Kind("certificate", 1, Certificate),
+    Kind("library", 1, Library),
+    Kind("rollouts", 1, Rollouts),
+)
+
+
+def kind_of(record: Any) -> Kind:
+    """The kind that a record object belongs to."""
+    return next(k for k in KINDS if type(record) is k.record)

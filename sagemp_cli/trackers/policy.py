@@ -1,0 +1,73 @@
+"""The tracking policy: one small multi-layer perceptron for all references (paper, section V-A)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from sagemp_cli.errors import ConfigError
+
+
+class Tracker(nn.Module):
+    """``u = pi(e)``: lookahead errors ``e (..., N, n)`` to controls ``(..., m)``, leaky-ReLU MLP.
+
+    The errors are flattened and multiplied by fixed per-state ``error_scale`` (a diagonal part of the first
+    linear layer, so it costs nothing to verify); the output is multiplied by ``control_scale`` and offset by
+    ``control_offset`` (hover thrust for flying robots). With unit scales and no offset it is the paper's plain MLP.
+
+    Because the reference is fixed in a proof, the first layer on ``[p_{k+1} - x_k, ..., p_{k+N} - x_k]`` is one
+    n-input linear layer whose bias depends on k: :meth:`folded` gives that form.
+    """
+
+    def __init__(
+        self,
+        *,
+        state_dim: int,
+        control_dim: int,
+        lookahead: int,
+        hidden: list[int],
+        negative_slope: float = 0.1,
+        error_scale: list[float] | None = None,
+        control_scale: list[float] | None = None,
+        control_offset: list[float] | None = None,
+    ) -> None:
+        super().__init__()
+        if lookahead < 1 or not hidden or min(hidden) < 1:
+            raise ConfigError(f"tracker: lookahead and hidden widths must be positive, found {lookahead} and {hidden}")
+        if not 0 <= negative_slope < 1:
+            raise ConfigError(f"tracker: negative_slope must lie in [0, 1), found {negative_slope}")
+        self.state_dim, self.control_dim, self.lookahead = state_dim, control_dim, lookahead
+        self.hidden, self.negative_slope = list(hidden), float(negative_slope)
+        for key, values, size, default in (
+            ("error_scale", error_scale, state_dim, 1.0),
+            ("control_scale", control_scale, control_dim, 1.0),
+            ("control_offset", control_offset, control_dim, 0.0),
+        ):
+            filled = [default] * size if values is None else [float(v) for v in values]
+            if len(filled) != size:
+                raise ConfigError(f"tracker: {key} needs {size} numbers, found {len(filled)}")
+            self.register_buffer(key, torch.tensor(filled, dtype=torch.float64))
+        widths = [lookahead * state_dim, *hidden, control_dim]
+        self.layers = nn.ModuleList(
+            nn.Linear(a, b, dtype=torch.float64) for a, b in zip(widths[:-1], widths[1:], strict=True)
+        )
+
+    def forward(self, errors: Tensor) -> Tensor:
+        """Controls ``(..., m)`` from lookahead errors ``(..., N, n)``."""
+        return self.after_first(self.layers[0]((errors * self.error_scale).flatten(-2)))
+
+    def after_first(self, h: Tensor) -> Tensor:
+        """Controls ``(..., m)`` from what the first layer gives ``(..., h)``, before its activation."""
+        for layer in self.layers[1:]:
+            h = layer(nn.functional.leaky_relu(h, self.negative_slope))
+        return h * self.control_scale + self.control_offset
+
+    def folded(self, window: Tensor) -> tuple[Tensor, Tensor]:
+        """First layer on a fixed window ``(..., N, n)`` as ``weight @ x + bias``: ``(h, n)`` and ``(..., h)``.
+
+        Equal to the first layer of :meth:`forward` in exact arithmetic.
+        """
+        first = self.layers[0]
+        blocks = first.weight.unflatten(-1, (self.lookahead, self.state_dim)) * self.error_scale
+        bias = torch.einsum("hjn,...jn->...h", blocks, window) + first.bias
+        return -blocks.sum(1), bias

@@ -1,0 +1,137 @@
+"""Training the tracker: back-propagation through closed-loop rollouts on the planner's own references.
+
+``training=plain`` minimises exactly the paper's loss. ``training=certified`` adds the width of a differentiable
+reach tube (forward affine arithmetic through the same loop), with the radius of the sets annealed from small to
+full: the tracker learns to be verifiable, not only to track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.progress import Progress
+from sagemp_cli.sets import Box
+from sagemp_cli.trackers.losses import LossWeights, rollout_loss
+from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.trackers.tube_loss import TubeLoss
+from sagemp_cli.training import History, fit
+
+
+@dataclass(frozen=True)
+class RolloutSampler:
+    """Draws closed loops, starts and disturbances for training from the sets that will be verified.
+
+    Half of the rollouts start in ``X_I`` at step 0; the others at a random later step from a smaller deviation,
+    so that the whole reference is seen whatever the rollout length.
+
+    Attributes:
+        references: ``(R, K+1, n)``.
+        start: ``X_I`` of one reference (its deviation from ``x_I`` is used for all).
+        disturbance: ``W``.
+        length: steps per rollout H.
+        spread: extra deviation in every state, as a share of the limits' range, for the later starts.
+    """
+
+    references: Tensor
+    start: Box
+    disturbance: Box
+    length: int
+    spread: Tensor
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """References ``(count, H+1.., n)`` shifted to their first step, starts ``(count, n)``, disturbances ``(count, H, n)``."""
+        total, horizon = self.references.shape[0], self.references.shape[1] - 1
+        chosen = torch.randint(total, (count,), generator=generator)
+        shift = torch.randint(max(1, horizon - self.length // 2), (count,), generator=generator)
+        early = torch.arange(count) < (count + 1) // 2
+        shift = torch.where(early, torch.zeros_like(shift), shift)
+        index = (shift[:, None] + torch.arange(horizon + 1)).clamp(max=horizon)
+        references = self.references[chosen[:, None], index]
+        offset = self.start.sample(count, generator) - self.start.center
+        unit = 2 * torch.rand(count, offset.shape[-1], dtype=torch.float64, generator=generator) - 1
+        share = torch.rand(count, 1, dtype=torch.float64, generator=generator)
+        late = 0.5 * share * offset + share * unit * self.spread
+        starts = references[:, 0] + torch.where(early[:, None], offset, late)
+        w = self.disturbance.sample(count * self.length, generator).unflatten(0, (count, self.length))
+        # Every second rollout is disturbed by constant extremes: independent noise averages out and teaches little.
+        sign = torch.sign(torch.randn(count, 1, w.shape[-1], dtype=torch.float64, generator=generator))
+        held = self.disturbance.center + sign * self.disturbance.radius
+        w = torch.where((torch.arange(count) % 2 == 0)[:, None, None], w, held.expand_as(w))
+        return references, starts, w
+
+
+def train_tracker(
+    tracker: Tracker,
+    dynamics: Dynamics,
+    *,
+    references: Tensor,
+    start: Box,
+    disturbance: Box,
+    generator: torch.Generator,
+    steps: int,
+    batch: int = 64,
+    rollout_steps: int = 40,
+    learning_rate: float = 5e-3,
+    weights: Mapping[str, float] | None = None,
+    tube: TubeLoss | None = None,
+    tube_from: float = 0.4,
+    checkpoint: Path | None = None,
+    identity: str = "",
+    progress: Progress | None = None,
+) -> History:
+    """Train ``tracker`` in place.
+
+    Args:
+        tracker: the policy.
+        dynamics: the robot, differentiable.
+        references: planner references ``(R, K+1, n)``.
+        start: ``X_I``.
+        disturbance: ``W``.
+        generator: source of all randomness.
+        steps: gradient steps.
+        batch: rollouts per step.
+        rollout_steps: steps H per rollout (at most K).
+        learning_rate: peak learning rate.
+        weights: ``track``, ``state``, ``control`` of :class:`LossWeights`.
+        tube: reachability-aware part, None for the paper's plain loss.
+        tube_from: share of the steps after which the tube's width enters.
+        checkpoint, identity, progress: see :func:`sagemp_cli.training.fit`.
+    """
+    horizon = references.shape[1] - 1
+    if not 1 <= rollout_steps <= horizon:
+        raise ConfigError(f"training.rollout_steps must lie in 1..{horizon}, found {rollout_steps}")
+    loss_weights = LossWeights(**(weights or {}))
+    spread = 0.05 * (dynamics.state_upper - dynamics.state_lower)
+    sampler = RolloutSampler(references, start, disturbance, rollout_steps, spread)
+    first = int(steps * tube_from)
+
+    def loss(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        assert isinstance(module, Tracker)
+        drawn, x, w = sampler.draw(batch, generator)
+        states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
+        value, figures = rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : rollout_steps + 1], loss_weights)
+        if tube is not None and step >= first:
+            progress_share = (step - first) / max(1, steps - 1 - first)
+            width, more = tube(module, dynamics, references, start, disturbance, progress_share, generator)
+            value, figures = value + width, figures | more
+        return value, figures
+
+    return fit(
+        tracker,
+        loss,
+        steps=steps,
+        learning_rate=learning_rate,
+        generator=generator,
+        checkpoint=checkpoint,
+        identity=identity,
+        progress=progress,
+        description="training the tracker",
+    )
