@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from sagemp_cli.errors import ConfigError, did_you_mean
@@ -31,7 +31,8 @@ def target_class(section: Mapping[str, Any], where: str) -> type:
     if not isinstance(target, str):
         raise ConfigError(f"{where}._target_ must name a class, found {target!r}")
     parts = target.split(".")
-    if len(parts) < 3 or parts[0] != "sagemp_cli" or parts[1] not in ALLOWED_PACKAGES:
+    plain = all(part.isidentifier() for part in parts)
+    if not plain or len(parts) < 3 or parts[0] != "sagemp_cli" or parts[1] not in ALLOWED_PACKAGES:
         allowed = ", ".join(f"sagemp_cli.{p}" for p in ALLOWED_PACKAGES)
         raise ConfigError(f"{where}._target_ '{target}' is not allowed; targets must be classes of {allowed}")
     module_name, name = ".".join(parts[:-1]), parts[-1]
@@ -56,18 +57,35 @@ def complaints(section: Mapping[str, Any], where: str, **extra: Any) -> list[str
         cls = target_class(section, where)
     except ConfigError as e:
         return [str(e)]
-    arguments = {k: v for k, v in section.items() if k != "_target_"} | extra
-    parameters, hints = inspect.signature(cls).parameters, get_type_hints(cls.__init__)
+    return option_complaints(cls, {k: v for k, v in section.items() if k != "_target_"}, where, given=extra)
+
+
+def option_complaints(
+    function: Callable[..., Any], options: Any, where: str, *, given: Collection[str] = ()
+) -> list[str]:
+    """Everything that is wrong with options as keyword arguments of a function or class.
+
+    Args:
+        function: what takes the options.
+        options: mapping of the config; None stands for no options.
+        where: name of the section in messages.
+        given: arguments that are given otherwise, which the options may not set.
+    """
+    options = {} if options is None else options
+    if not isinstance(options, Mapping):
+        return [f"{where} must be a mapping, found {options!r}"]
+    parameters = inspect.signature(function).parameters
+    allowed = [k for k in parameters if k not in given]
     found = []
-    for key, value in arguments.items():
-        if key not in parameters:
-            near = did_you_mean(key, parameters) or f"; it has {', '.join(parameters) or 'none'}"
-            found.append(f"{where}.{key}: {cls.__name__} has no such option{near}")
-        elif key not in extra and not _fits(value, hints.get(key, Any)):
+    for key, value in options.items():
+        if key not in allowed:
+            near = did_you_mean(str(key), allowed) or f"; known: {', '.join(allowed) or 'none'}"
+            found.append(f"{where}.{key}: {function.__name__} has no such option{near}")
+        elif not _fits(value, _hint(function, parameters[key].annotation)):
             found.append(f"{where}.{key} must be {parameters[key].annotation}, found {value!r}")
-    missing = [k for k, p in parameters.items() if p.default is p.empty and k not in arguments]
+    missing = [k for k in allowed if parameters[k].default is inspect.Parameter.empty and k not in options]
     if missing:
-        found.append(f"{where}: {cls.__name__} needs {', '.join(missing)}")
+        found.append(f"{where}: {function.__name__} needs {', '.join(missing)}")
     return found
 
 
@@ -85,6 +103,16 @@ def all_complaints(config: Mapping[str, Any]) -> list[str]:
 def _only_from_data(complaint: str) -> bool:
     _, needs, names = complaint.partition(" needs ")
     return bool(needs) and set(names.split(", ")) <= set(FROM_DATA)
+
+
+def _hint(function: Callable[..., Any], annotation: Any) -> Any:
+    """The type that an annotation names; Any if it is a name that exists for type checkers only."""
+    home = function.__init__ if inspect.isclass(function) else function
+    holder = SimpleNamespace(__annotations__={"it": annotation})
+    try:
+        return get_type_hints(holder, globalns=getattr(home, "__globals__", {}))["it"]
+    except NameError:
+        return Any
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -6,6 +6,7 @@ class. How sections become objects is in :mod:`sagemp_cli.binding`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     parsed = [_parse(text) for text in overrides]
     choices = [o.input_line for o in parsed if _is_group(o.key_or_group)]
     values = [o for o in parsed if not _is_group(o.key_or_group)]
-    before = dict(_leaves(_composed(choices))) if values else {}
+    before = _leaves_of(tuple(choices)) if values else {}
     for override in values:
         _check_override(override, before)
     config = _composed([o.input_line for o in parsed])
@@ -122,6 +123,8 @@ def _parse(text: str) -> Any:
         raise ConfigError(f"'{text}' is not an override of the form key=value: {_first_line(e)}") from None
     if override.is_sweep_override():
         raise ConfigError(f"{text}: sweeps are not supported; give one value (lists are written [1,2])")
+    if override.is_delete():
+        raise ConfigError(f"{text}: keys cannot be removed; set another value")
     group = override.key_or_group
     if _is_group(group):
         choice, known = override.value(), options_of(group)
@@ -140,7 +143,7 @@ def _check_override(override: Any, before: Mapping[str, Any]) -> None:
         top = sorted({k.partition(".")[0] for k in before})
         near = did_you_mean(key, before)
         raise ConfigError(f"{key}: unknown key{near}" + ("" if near else f"; known at the top: {', '.join(top)}"))
-    if override.is_delete() or key in _OWN_CHECK:
+    if key in _OWN_CHECK:
         return
     old, new = before[key], override.value()
     section = before.get(key.rpartition(".")[0])
@@ -169,6 +172,12 @@ def _is_number(value: Any) -> bool:
 
 def _is_numbers(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(_is_number(v) for v in value)
+
+
+@functools.cache
+def _leaves_of(choices: tuple[str, ...]) -> Mapping[str, Any]:
+    """All dotted keys, with their values, of the config that picks these options and overrides nothing."""
+    return dict(_leaves(_composed(choices)))
 
 
 def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

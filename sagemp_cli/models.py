@@ -54,26 +54,25 @@ def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:
 def curve_of(history: History) -> TrainingCurve:
     """A training run's figures in one table: loss, what was reported beside it, validation figures."""
     steps = np.arange(len(history.loss), dtype=np.int64)
-    columns = {"loss": history.loss, **history.figures}
-    for name, values in history.validation.items():
+    columns = {"loss": history.loss, **{name: history.figures[name] for name in sorted(history.figures)}}
+    for name, values in sorted(history.validation.items()):
         column = np.full(len(steps), np.nan)
         # A validation after v updates belongs to the last of them.
         column[np.asarray(history.validated_at) - 1] = values
         columns[f"validation {name}"] = column
-    return TrainingCurve(
-        step=steps, names=tuple(columns), values=np.stack([np.asarray(c, dtype=np.float64) for c in columns.values()], 1)
-    )
+    values = np.stack([np.asarray(column, dtype=np.float64) for column in columns.values()], axis=1)
+    return TrainingCurve(step=steps, names=tuple(columns), values=values)
 
 
 def figures_at_end(history: History) -> dict[str, float]:
     """A model card: the last validation's figures, and the last twentieth's mean of what every update measured."""
     tail = max(1, len(history.loss) // 20)
     figures = {"loss": float(np.mean(history.loss[-tail:]))}
-    for name, values in history.figures.items():
+    for name, values in sorted(history.figures.items()):
         measured = values[-tail:][np.isfinite(values[-tail:])]
         if len(measured):
             figures[name] = float(measured.mean())
-    return figures | {name: float(values[-1]) for name, values in history.validation.items()}
+    return figures | {name: float(values[-1]) for name, values in sorted(history.validation.items())}
 
 
 def _arguments(text: str, artifact: Artifact[Any]) -> dict[str, Any]:
@@ -82,7 +81,7 @@ def _arguments(text: str, artifact: Artifact[Any]) -> dict[str, Any]:
     except json.JSONDecodeError as e:
         raise ArtifactError(f"{artifact.path}: constructor arguments are not JSON ({e})") from None
     if not isinstance(arguments, dict):
-        raise ArtifactError(f"{artifact.path}: constructor arguments must be a mapping, found {type(arguments).__name__}")
+        raise ArtifactError(f"{artifact.path}: arguments must be a mapping, found {type(arguments).__name__}")
     return arguments
 
 

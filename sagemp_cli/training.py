@@ -57,6 +57,20 @@ class History:
     validated_at: np.ndarray
     validation: Mapping[str, np.ndarray]
 
+    def then(self, later: History) -> History:
+        """This run followed by another of the same module; figures that only one reported are NaN in the other."""
+
+        def joined(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], sizes: tuple[int, int]) -> dict:
+            missing = [np.full(size, np.nan) for size in sizes]
+            return {k: np.concatenate([a.get(k, missing[0]), b.get(k, missing[1])]) for k in {**a, **b}}
+
+        return History(
+            loss=np.concatenate([self.loss, later.loss]),
+            figures=joined(self.figures, later.figures, (len(self.loss), len(later.loss))),
+            validated_at=np.concatenate([self.validated_at, later.validated_at + len(self.loss)]),
+            validation=joined(self.validation, later.validation, (len(self.validated_at), len(later.validated_at))),
+        )
+
 
 def learning_rate_at(step: int, *, steps: int, peak: float, warmup: int, schedule: str) -> float:
     """The learning rate of update ``step`` in ``0..steps-1``.

@@ -103,9 +103,7 @@ def execute_queries(
             x = starts[q].expand(rollouts, -1)
             w = random_disturbances(library.disturbance, calm, horizon=horizon, generator=generator)
             if rollouts > calm:
-                harm = worst_case_disturbances(
-                    loop, x[calm:], disturbance=library.disturbance, generator=generator
-                )
+                harm = worst_case_disturbances(loop, x[calm:], disturbance=library.disturbance, generator=generator)
                 w = torch.cat([w, harm])
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)
@@ -116,9 +114,7 @@ def execute_queries(
             parts.append((torch.full((rollouts,), q), states, controls, w, inside_tube(states, cells, tubes), safe))
             task.advance()
     query, states, controls, disturbances, in_tube, safe = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Execution(
-        sampled, chosen, torch.from_numpy(error), query, states, controls, disturbances, in_tube, safe
-    )
+    return Execution(sampled, chosen, torch.from_numpy(error), query, states, controls, disturbances, in_tube, safe)
 
 
 def inside_tube(states: Tensor, cells: Box, tubes: Tube, *, margin: float = ROUNDING) -> Tensor:

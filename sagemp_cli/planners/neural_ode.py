@@ -98,7 +98,7 @@ class NeuralODE(nn.Module):
         self.normalizer.fit(demonstrations)
         self.field.reset(generator)
 
-    def advance(self, z: Tensor, first: int, count: int, *, drift: Tensor | None = None) -> Tensor:
+    def advance(self, z: Tensor, first: int | Tensor, count: int, *, drift: Tensor | None = None) -> Tensor:
         """Integrate ``count`` reference steps from step ``first``, differentiably.
 
         Args:

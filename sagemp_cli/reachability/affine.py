@@ -22,6 +22,7 @@ from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine_form import AffineForm, StepFrame
 from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.reduction import reduce_generators
 from sagemp_cli.reachability.relaxations.band import UNIT, Band
 from sagemp_cli.sets import Box, Tube
@@ -34,10 +35,16 @@ class AffineRun:
     Attributes:
         tube: bounds per step, ``(*batch, K+1, n)``.
         bands: per step, the bands used, in the order of evaluation.
+        kept: per step, the mask of the generators kept ``(*batch, M)``; empty if none were ever dropped.
     """
 
     tube: Tube
     bands: list[list[tuple[str, Band]]] = field(repr=False)
+    kept: list[Tensor] = field(default_factory=list, repr=False)
+
+    def recording(self) -> Recording:
+        """What a certificate keeps of the run."""
+        return Recording.of(self.bands, self.tube.lower.shape[:-2], self.kept)
 
 
 @dataclass(frozen=True)
@@ -64,11 +71,16 @@ class Affine:
     @torch.no_grad()
     def propagate_with_controls(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor]:
         """The tube and, per step, bounds of the controls ``(*batch, K, m)`` over it, from the same pass."""
+        return self.prove(loop, start, disturbance)[:3]
+
+    @torch.no_grad()
+    def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
+        """As :meth:`propagate_with_controls`, with what a certificate keeps of the proof."""
         watched = _Watched(loop, [])
-        tube = self.propagate(watched, start, disturbance)
+        run = self.run(watched, start, disturbance)
         lower, upper = (torch.stack(side, dim=-2) for side in zip(*watched.controls, strict=True))
         bad = torch.isnan(lower) | torch.isnan(upper)
-        return tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
+        return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
 
     def run(self, loop: Loop, start: Box, disturbance: Box, *, horizon: int | None = None) -> AffineRun:
         """Propagate and keep the bands (differentiable where autograd is on)."""
@@ -76,7 +88,7 @@ class Affine:
         generators = torch.diag_embed(radius)
         reach = radius
         w_center, w_radius = disturbance.center, disturbance.radius
-        lowers, uppers, bands = [start.lower], [start.upper], []
+        lowers, uppers, bands, masks = [start.lower], [start.upper], [], []
         steps = loop.horizon if horizon is None else horizon
         for k in range(steps):
             frame = StepFrame(generators, reach, w_radius)
@@ -84,7 +96,8 @@ class Affine:
             bands.append(frame.bands)
             center, generators = _advance(after, frame)
             if self.symbols is not None:
-                generators = reduce_generators(generators, self.symbols)
+                generators, mask = reduce_generators(generators, self.symbols)
+                masks.append(mask)
             growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
             reach = generators.abs().sum(-1) * growth
             spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
@@ -92,7 +105,7 @@ class Affine:
             uppers.append(center + spread)
             if not bool(torch.isfinite(reach).all()):
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
-        return AffineRun(Tube(torch.stack(lowers, -2), torch.stack(uppers, -2)), bands)
+        return AffineRun(Tube(torch.stack(lowers, -2), torch.stack(uppers, -2)), bands, masks)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ starts again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -52,8 +53,11 @@ class StepFrame:
         self.size = self.inputs
         self.batch = generators.shape[:-2]
         self.bands: list[tuple[str, Band]] = []
-        # gamma for sums over all symbols and for the products with the generators
-        self.sum_error = 2 * (generators.shape[-1] + self.states + 64) * UNIT
+
+    @property
+    def sum_error(self) -> float:
+        """Relative error (gamma) of sums over all symbols and of the products with the generators."""
+        return 2 * (self.generators.shape[-1] + self.size + 64) * UNIT
 
     def own_radius(self, count: int) -> Tensor:
         """Radii of the first ``count`` variables after the state: the disturbance's, then ones."""
@@ -64,25 +68,19 @@ class StepFrame:
 
     def state(self, center: Tensor) -> AffineForm:
         """The current state as a form."""
-        n = self.states
-        unit = center.new_zeros(self.inputs, n)
-        unit[:n].fill_diagonal_(1.0)
-        coefficients = unit.view(self.inputs, *[1] * len(self.batch), n).expand(self.inputs, *self.batch, n)
-        return AffineForm(self, center, coefficients, center.abs() + self.reach + TINY, 0.0)
+        return AffineForm(self, center, self._unit(0, self.states, center), center.abs() + self.reach + TINY, 0.0)
 
     def disturbance(self, center: Tensor) -> AffineForm:
         """The current disturbance as a form."""
-        d = self.inputs - self.states
-        unit = center.new_zeros(self.inputs, d)
-        unit[self.states :].fill_diagonal_(1.0)
-        shape = (*self.batch, d)
-        return AffineForm(
-            self,
-            center.expand(shape),
-            unit.view(self.inputs, *[1] * len(self.batch), d).expand(self.inputs, *shape),
-            (center.abs() + self.disturbance_radius + TINY).expand(shape),
-            0.0,
-        )
+        shape = (*self.batch, self.inputs - self.states)
+        magnitude = (center.abs() + self.disturbance_radius + TINY).expand(shape)
+        return AffineForm(self, center.expand(shape), self._unit(self.states, self.inputs, center), magnitude, 0.0)
+
+    def _unit(self, first: int, last: int, like: Tensor) -> Tensor:
+        """Coefficients of the variables ``first..last-1`` themselves."""
+        unit = torch.eye(self.inputs, dtype=like.dtype, device=like.device)[:, first:last]
+        shape = (self.inputs, *self.batch, last - first)
+        return unit.reshape(self.inputs, *[1] * len(self.batch), last - first).expand(shape)
 
 
 class AffineForm:
@@ -131,6 +129,11 @@ class AffineForm:
     def _rows(self) -> Tensor:
         """Coefficients as ``(*batch, events, variables)``."""
         coefficients, batch = self.coefficients, self.frame.batch
+        if self.center.shape[: len(batch)] != batch:
+            raise UnsupportedOperationError(
+                f"a value of shape {tuple(self.shape)} has lost the batch dimensions {tuple(batch)}; "
+                f"index, sum and flatten from the end, as in x[..., 0]"
+            )
         if coefficients.dim() != len(batch) + 2:
             coefficients = coefficients.reshape(coefficients.shape[0], *batch, -1)
         return coefficients.movedim(0, -1)
@@ -144,7 +147,7 @@ class AffineForm:
         frame = self.frame
         rows = self._rows()
         n = frame.states
-        own = rows[..., n:].abs() @ frame.own_radius(rows.shape[-1] - n)
+        own = (rows[..., n:].abs() * frame.own_radius(rows.shape[-1] - n)).sum(-1)
         total = (rows[..., :n] @ frame.generators).abs().sum(-1) + own
         return total.reshape(self.shape) + self.slack()
 
@@ -171,21 +174,24 @@ class AffineForm:
         """The form of ``f(self)`` for a band of f over :meth:`bounds`."""
         frame = self.frame
         slope, offset, radius = band
-        carried = slope.abs() * self.magnitude
-        magnitude = carried + offset.abs() + radius + TINY
-        radius = radius * _SAFETY + carried * (self.error * _SAFETY) + magnitude * (4 * UNIT)
+        magnitude = slope.abs() * self.magnitude + offset.abs() + (radius + TINY)
+        radius = radius * _SAFETY + magnitude * ((self.error + 4 * UNIT) * _SAFETY)
         frame.bands.append((name, band))
         return self._with_fresh(self.center * slope + offset, self.coefficients * slope, magnitude, radius)
 
     def _with_fresh(self, center: Tensor, coefficients: Tensor, magnitude: Tensor, radius: Tensor) -> AffineForm:
         """Append one new variable per entry with the given radius."""
         frame = self.frame
-        flat = radius.reshape(*frame.batch, -1)
-        fresh = torch.diag_embed(flat).movedim(-1, 0).reshape(flat.shape[-1], *center.shape)
-        gap = frame.size - coefficients.shape[0]
-        parts = [coefficients, fresh] if gap == 0 else [coefficients, center.new_zeros(gap, *center.shape), fresh]
-        frame.size += flat.shape[-1]
-        return AffineForm(frame, center, torch.cat(parts), magnitude + radius, 4 * UNIT)
+        batch = len(frame.batch)
+        events = math.prod(center.shape[batch:])
+        fresh = center.new_zeros(frame.size - coefficients.shape[0] + events, *center.shape)
+        if center.dim() == batch:
+            fresh[-1] = radius
+        else:
+            flat = fresh[-events:].flatten(batch + 1)
+            flat.diagonal(dim1=0, dim2=-1).copy_(radius.flatten(batch))
+        frame.size += events
+        return AffineForm(frame, center, torch.cat([coefficients, fresh]), magnitude + radius, 4 * UNIT)
 
     # -- operators -----------------------------------------------------------------------------------------------
 
@@ -217,6 +223,24 @@ class AffineForm:
     def __pow__(self, exponent: Any) -> AffineForm:
         return torch.pow(self, exponent)
 
+    def __rpow__(self, base: Any) -> AffineForm:
+        return torch.pow(base, self)
+
+    def __abs__(self) -> AffineForm:
+        return torch.abs(self)
+
+    def __bool__(self) -> bool:
+        raise UnsupportedOperationError(
+            "a step may not branch on a value: the truth of a set is not one of True and False; "
+            "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+        )
+
+    def _compare(self, other: Any) -> bool:
+        return self.__bool__()
+
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
+    __hash__ = object.__hash__
+
     def __matmul__(self, other: Any) -> AffineForm:
         return torch.matmul(self, other)
 
@@ -228,6 +252,8 @@ class AffineForm:
         method = getattr(torch.Tensor, name, None)
         if method is None or name.startswith("__"):
             raise AttributeError(name)
+        if not callable(method):
+            raise _unsupported(name)
         return lambda *args, **kwargs: _dispatch(method, (self, *args), kwargs)
 
     @classmethod
@@ -255,12 +281,15 @@ def handles(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     handler = HANDLERS.get(function)
     if handler is None:
-        name = getattr(function, "__name__", str(function))
-        raise UnsupportedOperationError(
-            f"torch operation '{name}' has no relaxation in the affine propagator; "
-            f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
-        )
+        raise _unsupported(getattr(function, "__name__", str(function)))
     return handler(*args, **kwargs)
+
+
+def _unsupported(name: str) -> UnsupportedOperationError:
+    return UnsupportedOperationError(
+        f"torch operation '{name}' has no relaxation in the affine propagator; "
+        f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
+    )
 
 
 def _frame_of(*values: Any) -> StepFrame:
@@ -314,7 +343,7 @@ def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
 @handles(torch.sub, torch.Tensor.sub, torch.Tensor.__sub__)
 def subtract(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
     """Difference."""
-    return add(a, multiply(b, -alpha) if isinstance(b, AffineForm) else -torch.as_tensor(b) * alpha)
+    return add(a, multiply(b, -alpha) if isinstance(b, AffineForm) else -b * alpha)
 
 
 @handles(torch.rsub, torch.Tensor.__rsub__)
@@ -349,9 +378,13 @@ def multiply(a: Any, b: Any) -> AffineForm:
 
 @handles(torch.div, torch.Tensor.div, torch.true_divide, torch.Tensor.__truediv__)
 def divide(a: Any, b: Any) -> AffineForm:
-    """Quotient with a constant denominator, else the product with the reciprocal."""
+    """Quotient with a constant denominator, or of two forms by way of the reciprocal."""
     if isinstance(b, AffineForm):
-        return multiply(torch.reciprocal(b), a)
+        if not isinstance(a, AffineForm):
+            return multiply(torch.reciprocal(b), a)
+        # a / b = q + (a - q b) / b for any q: near the centres' quotient what the two share cancels before the product.
+        q = (a.center / b.center).detach().nan_to_num(0.0, 0.0, 0.0)
+        return add(multiply(subtract(a, multiply(b, q)), torch.reciprocal(b)), q)
     value = constant(a.frame, b, a.center)
     shape = _broadcast(a.shape, value.shape)
     center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
@@ -363,39 +396,40 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
 
     ``(c + X)(d + Y) = c d + c Y + d X + X Y`` and, with ``P = l X + Y / l`` and ``M = l X - Y / l`` for any l > 0,
     ``X Y = (P^2 - M^2) / 4`` lies in ``[-r_M^2 / 4, r_P^2 / 4]``: equal to the usual ``r_X r_Y`` for independent
-    operands, up to half as wide for correlated ones (exact for a square). l is a power of two near
-    ``sqrt(r_Y / r_X)``, so scaling is exact.
+    operands, up to half as wide for correlated ones (exact for a square). Best is ``l = sqrt(r_Y / r_X)``.
     """
     frame = a.frame
     shape = _broadcast(a.shape, b.shape)
     size = max(a.coefficients.shape[0], b.coefficients.shape[0])
     (c, gx, mx), (d, gy, my) = _expand(a, shape, size), _expand(b, shape, size)
-    x = AffineForm(frame, c, gx, mx, a.error)
-    y = AffineForm(frame, d, gy, my, b.error)
-    rows_x, rows_y = x.spread(), y.spread()
-    slack_x, slack_y = x.slack(), y.slack()
-    radius_x = rows_x.abs().sum(-1).reshape(shape) + slack_x
-    radius_y = rows_y.abs().sum(-1).reshape(shape) + slack_y
+    error = max(a.error, b.error)
+    rows_x = AffineForm(frame, c, gx, mx, error).spread()
+    rows_y = AffineForm(frame, d, gy, my, error).spread()
+    # Rounding of the rows, of their sums, and of scaling (2 more units each) is within twice the usual slack.
+    share = 2 * (error + frame.sum_error) * _SAFETY
+    slack_x, slack_y = mx * share, my * share
     with torch.no_grad():
-        ratio = ((radius_y + TINY) / (radius_x + TINY)).log2().mul_(0.5).round_().clamp_(-200, 200).exp2_()
+        radius_x = rows_x.abs().sum(-1).reshape(shape) + slack_x
+        ratio = torch.sqrt((rows_y.abs().sum(-1).reshape(shape) + slack_y) / radius_x)
     scale = ratio.reshape(rows_x.shape[:-1])[..., None]
     scaled_x, scaled_y = rows_x * scale, rows_y / scale
-    slack = (slack_x * ratio + slack_y / ratio) * (1 + 4 * UNIT)
+    slack = (slack_x * ratio + slack_y / ratio) * _SAFETY
     plus = (scaled_x + scaled_y).abs().sum(-1).reshape(shape) + slack
     minus = (scaled_x - scaled_y).abs().sum(-1).reshape(shape) + slack
     high, low = plus * plus * 0.25, minus * minus * 0.25
     middle, half = 0.5 * (high - low), 0.5 * (high + low)
-    magnitude = c.abs() * my + d.abs() * mx + c.abs() * d.abs() + half + TINY
-    radius = half * _SAFETY + magnitude * ((max(a.error, b.error) + 8 * UNIT) * _SAFETY)
-    frame.bands.append(("product", Band(ratio, middle, radius)))
-    return x._with_fresh(c * d + middle, c * gy + d * gx, magnitude, radius)
+    larger, other = c.abs() * my, d.abs() * mx
+    magnitude = larger + other + half + TINY  # |c| my >= |c d|, and half >= |middle|
+    radius = half * _SAFETY + magnitude * ((2 * error + 16 * UNIT) * _SAFETY)
+    frame.bands.append(("product", Band(ratio, middle, half)))
+    return AffineForm(frame, c, gx, mx, error)._with_fresh(c * d + middle, c * gy + d * gx, magnitude, radius)
 
 
 @handles(torch.nn.functional.linear)
 def linear(x: AffineForm, weight: Tensor, bias: Tensor | None = None) -> AffineForm:
     """``x W^T + b``; one matrix product each for centre, coefficients and magnitude."""
     apply = torch.nn.functional.linear
-    magnitude = apply(x.magnitude, weight.abs()) + (TINY if bias is None else bias.abs() + TINY)
+    magnitude = apply(x.magnitude, weight.abs(), None if bias is None else bias.abs()) + TINY
     error = x.error + (weight.shape[-1] + 2) * UNIT
     return AffineForm(x.frame, apply(x.center, weight, bias), apply(x.coefficients, weight), magnitude, error)
 
@@ -409,8 +443,10 @@ def matrix_product(x: Any, y: Any) -> AffineForm:
 
 
 @handles(torch.sum, torch.Tensor.sum)
-def total(x: AffineForm, dim: int, keepdim: bool = False) -> AffineForm:
+def total(x: AffineForm, dim: Any = None, keepdim: bool = False) -> AffineForm:
     """Sum over one event dimension."""
+    if not isinstance(dim, int):
+        raise UnsupportedOperationError(f"torch operation 'sum' is supported over one dimension, found dim={dim}")
     count = x.shape[dim]
     moved = x._linear(lambda t: t.sum(_from_end(dim, x), keepdim))
     return AffineForm(x.frame, moved.center, moved.coefficients, moved.magnitude, x.error + count * UNIT)

@@ -94,7 +94,8 @@ def attack(
                         if safe:
                             raise SoundnessError(
                                 f"reference {r} was certified by '{verification.propagator}', but a replayed rollout "
-                                f"breaks '{example.name}' at step {example.step} by {example.depth:.3g}; please report this"
+                                f"breaks '{example.name}' at step {example.step} by {example.depth:.3g}; "
+                                "please report this"
                             )
                         found.append((r, example))
                         verdicts[r] = Verdict(Outcome.UNSAFE, example.step, example.name)

@@ -33,7 +33,7 @@ class Outcome(StrEnum):
 
 
 class Answer(StrEnum):
-    """The answer to the question whether all references are certified, in the words of the verification competitions."""
+    """Whether all references are certified, in the words of the verification competitions."""
 
     VERIFIED = "VERIFIED"
     FALSIFIED = "FALSIFIED"

@@ -76,12 +76,10 @@ def blank_figure(width: float, height: float) -> Figure:
 
 def headline(figure: Figure, text: str, subtitle: str, *, colour: str = INK) -> None:
     """Two lines at the top left: what the figure says, and under which conditions."""
-    figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.62 / figure.get_figheight()))
+    figure.get_layout_engine().set(rect=(0.004, 0.004, 0.988, 0.996 - 0.62 / figure.get_figheight()))
     top = 1 - 0.12 / figure.get_figheight()
     figure.text(0.012, top, text, ha="left", va="top", fontsize=14, fontweight="bold", color=colour)
-    figure.text(
-        0.012, top - 0.27 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9.5, color=MUTED
-    )
+    figure.text(0.012, top - 0.27 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9.5, color=MUTED)
 
 
 def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "") -> None:
@@ -150,9 +148,20 @@ def draw_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, **options: Any)
     axes.add_collection(PatchCollection(patches, **options))
 
 
-def tube_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3) -> None:
-    """A tube's cross-sections ``(K+1, 2)`` over the plane, coloured by time, the latest in front."""
-    shade = TIME(np.linspace(0, 1, len(lower)))
+def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
+    """How many steps of tubes ``(cells, K+1, n)`` can be drawn: up to the first that is wider than the workspace."""
+    size = (setting.scene.workspace.upper - setting.scene.workspace.lower).numpy()
+    position = list(setting.dynamics.position)
+    with np.errstate(invalid="ignore", over="ignore"):
+        fits = (upper[..., position] - lower[..., position] <= size).all(-1).all(0)
+    return len(fits) if fits.all() else int(fits.argmin())
+
+
+def tube_boxes(
+    axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3, of: int | None = None
+) -> None:
+    """A tube's cross-sections ``(steps, 2)`` over the plane, coloured by time, the latest in front; ``of`` K + 1."""
+    shade = TIME(np.arange(len(lower)) / max(1, (of or len(lower)) - 1))
     draw_boxes(axes, lower, upper, facecolors=shade, edgecolors="none", alpha=alpha, zorder=3)
     draw_boxes(axes, lower, upper, facecolors="none", edgecolors=shade, linewidths=0.35, alpha=0.75, zorder=3.1)
 
@@ -163,7 +172,12 @@ def time_bar(figure: Figure, axes: Axes | Sequence[Axes], seconds: float) -> Non
     from matplotlib.colors import Normalize
 
     bar = figure.colorbar(
-        ScalarMappable(Normalize(0, seconds), TIME), ax=axes, orientation="horizontal", fraction=0.035, pad=0.02, aspect=45
+        ScalarMappable(Normalize(0, seconds), TIME),
+        ax=axes,
+        orientation="horizontal",
+        fraction=0.035,
+        pad=0.02,
+        aspect=45,
     )
     bar.outline.set_visible(False)
     bar.ax.tick_params(colors=MUTED, labelsize=8.5, length=3)
@@ -182,6 +196,19 @@ def goal_at_end(axes: Axes, setting: Setting, state: int, end: float) -> None:
 def legend(axes: Axes, **options: Any) -> None:
     """A legend without a box around it."""
     axes.legend(**({"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.6} | options))
+
+
+def legend_above(axes: Axes, handles: Sequence[Any]) -> None:
+    """A one-line legend above the axes at the right, where it hides nothing."""
+    legend(
+        axes,
+        handles=handles,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 0.995),
+        ncols=len(handles),
+        borderaxespad=0.1,
+        columnspacing=1.4,
+    )
 
 
 def _box(lower: Sequence[float], upper: Sequence[float], **options: Any) -> Rectangle:

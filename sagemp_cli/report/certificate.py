@@ -14,6 +14,7 @@ from sagemp_cli.report.canvas import (
     MODES,
     MUTED,
     REFERENCE,
+    UNKNOWN,
     VERDICT_COLOURS,
     Setting,
     blank_figure,
@@ -23,6 +24,8 @@ from sagemp_cli.report.canvas import (
     goal_at_end,
     headline,
     legend,
+    legend_above,
+    shown_steps,
     style_axes,
     time_bar,
     tube_boxes,
@@ -61,7 +64,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     ]
     if record.counterexamples:
         handles.append(Line2D([], [], color=DANGER, lw=1.6, marker="X", label="counterexample"))
-    legend(scene, handles=handles, loc="lower left", ncols=3)
+    legend_above(scene, handles)
     time_bar(figure, scene, horizon * dynamics.dt)
 
     times, first = dynamics.dt * np.arange(horizon + 1), None
@@ -71,7 +74,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
         style_axes(axes, ylabel=setting.label(state))
         axes.tick_params(labelbottom=False)
         for r in range(count):
-            _band(axes, times, tubes, r, state)
+            _band(axes, times, setting, tubes, r, state)
         for example in record.counterexamples:
             axes.plot(times, example.states[:, state], color=DANGER, linewidth=1.2, zorder=8)
         goal_at_end(axes, setting, state, times[-1])
@@ -96,10 +99,11 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
 def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alpha: float = 0.3) -> None:
     """One reference in the workspace: cross-sections of its cells' tubes, its start cells, and itself."""
     mine, plane = tubes.cell_reference == reference, setting.plane
-    lower, upper = tubes.tube_lower[mine][..., plane], tubes.tube_upper[mine][..., plane]
+    steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
+    lower, upper = tubes.tube_lower[mine][:, :steps, plane], tubes.tube_upper[mine][:, :steps, plane]
     alpha = alpha / np.sqrt(max(1, len(lower) / 4))
     for low, high in zip(lower, upper, strict=True):
-        tube_boxes(axes, low, high, alpha=alpha)
+        tube_boxes(axes, low, high, alpha=alpha, of=tubes.tube_lower.shape[1])
     draw_boxes(
         axes,
         tubes.cell_lower[mine][:, plane],
@@ -113,14 +117,20 @@ def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alp
     axes.plot(*path.T, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=7)
 
 
-def _band(axes: Axes, times: np.ndarray, tubes: Tubes, reference: int, state: int) -> None:
+def _band(
+    axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, reference: int, state: int
+) -> None:
+    """Bounds of one state, cell by cell; where the tube outgrows the workspace it ends at a dashed line."""
     mine, colour = tubes.cell_reference == reference, MODES[reference % len(MODES)]
-    lower, upper = tubes.tube_lower[mine][..., state], tubes.tube_upper[mine][..., state]
-    finite = np.isfinite(lower).all(0) & np.isfinite(upper).all(0)
+    steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
+    lower, upper = tubes.tube_lower[mine][:, :steps, state], tubes.tube_upper[mine][:, :steps, state]
     for low, high in zip(lower, upper, strict=True):
-        axes.fill_between(times[finite], low[finite], high[finite], color=colour, alpha=0.15, linewidth=0)
-    axes.plot(times[finite], lower.min(0)[finite], color=colour, linewidth=0.9)
-    axes.plot(times[finite], upper.max(0)[finite], color=colour, linewidth=0.9)
+        axes.fill_between(times[:steps], low, high, color=colour, alpha=0.15, linewidth=0)
+    if steps:
+        axes.plot(times[:steps], lower.min(0), color=colour, linewidth=0.9)
+        axes.plot(times[:steps], upper.max(0), color=colour, linewidth=0.9)
+    if steps < len(times):
+        axes.axvline(times[steps], color=UNKNOWN, linewidth=1.1, linestyle=(0, (2, 2)))
     axes.plot(times, tubes.references[reference, :, state], color=REFERENCE, linewidth=1.0, linestyle=(0, (4, 2)))
 
 

@@ -8,7 +8,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sagemp_cli.report.canvas import MODES, MUTED, Setting, blank_figure, draw_paths, draw_scene, headline, legend, style_axes
+from sagemp_cli.report.canvas import (
+    MODES,
+    MUTED,
+    Setting,
+    blank_figure,
+    draw_paths,
+    draw_scene,
+    headline,
+    legend_above,
+    style_axes,
+)
 from sagemp_cli.storage import Artifact, Demonstrations
 
 
@@ -32,10 +42,8 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
         )
     starts = record.states[:, 0, setting.plane]
     scene.scatter(starts[:, 0], starts[:, 1], s=5, color=MUTED, linewidths=0, zorder=4)
-    handles = [
-        Line2D([], [], color=colour[s], lw=2, label=f"{s or 'free'}: {int((sides == s).sum())}") for s in groups
-    ]
-    legend(scene, handles=handles, loc="lower left", ncols=len(groups), title="side per obstacle", title_fontsize=8.5)
+    handles = [Line2D([], [], color=colour[s], lw=2, label=f"{s or 'free'}: {int((sides == s).sum())}") for s in groups]
+    legend_above(scene, handles)
 
     times = dynamics.dt * np.arange(horizon)
     for i, name in enumerate(dynamics.control_names):
@@ -55,8 +63,8 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
         figure,
         f"{count} demonstrations",
         f"{artifact.header.experiment}, K = {horizon}, dt = {dynamics.dt:g} s; "
-        f"{len(groups)} combinations of sides, {len(record.failed)} problems unsolved; "
-        f"smallest clearance {record.clearance.min():.2f} m, limits exceeded by at most "
-        f"{max(record.control_violation.max(), record.state_violation.max()):.0e}",
+        f"{len(record.failed)} problems unsolved; obstacles passed on the left (L) or right (R) in {len(groups)} "
+        f"combination{'s' * (len(groups) > 1)}; smallest clearance {record.clearance.min():.2f} m, "
+        f"limits exceeded by {max(record.control_violation.max(), record.state_violation.max()):.2g}",
     )
     return figure

@@ -20,7 +20,7 @@ from sagemp_cli.report.canvas import (
     draw_scene,
     draw_start,
     headline,
-    legend,
+    legend_above,
     style_axes,
 )
 from sagemp_cli.storage import Artifact, Library
@@ -53,7 +53,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         handles.append(Line2D([], [], color=DANGER, lw=2, label="reference rejected"))
     if (~early).any():
         handles.append(Line2D([], [], color=UNKNOWN, lw=2, label="tube rejected"))
-    legend(scene, handles=handles, loc="lower left", ncols=3)
+    legend_above(scene, handles)
 
     axes = figure.add_subplot(grid[1])
     names = ["certified", *record.reason_names]
@@ -73,8 +73,9 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         f"Library of {count} certified reference{'s' * (count > 1)}"
         + (f" ({record.wanted} wanted)" if count < record.wanted else ""),
         f"{artifact.header.experiment}: {record.sampled} references sampled, "
-        f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, {tubes.propagator} in {tubes.seconds.sum():.2g} s; "
-        f"smallest certified clearance {tubes.clearance.min():.2f} m",
+        f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, "
+        f"{tubes.propagator} in {tubes.seconds.sum():.2g} s; "
+        f"certified clearance at least {tubes.clearance.min():.2f} m",
         colour=SAFE if count >= record.wanted else INK,
     )
     return figure

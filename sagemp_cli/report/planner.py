@@ -17,9 +17,9 @@ from sagemp_cli.report.canvas import (
     draw_scene,
     draw_start,
     headline,
-    legend,
+    legend_above,
 )
-from sagemp_cli.report.training import draw_curves
+from sagemp_cli.report.training import draw_losses, draw_validation
 from sagemp_cli.storage import Artifact, PlannerModel
 
 SAMPLES = 80
@@ -42,8 +42,8 @@ def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
     paths = references[..., setting.plane].numpy()
 
     figure = blank_figure(13, 5.2)
-    grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1))
-    scene = figure.add_subplot(grid[0])
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
+    scene = figure.add_subplot(grid[:, 0])
     draw_scene(scene, setting)
     draw_start(scene, setting)
     draw_paths(scene, paths[clear], colors=MODES[0], linewidths=0.9, alpha=0.45)
@@ -53,13 +53,15 @@ def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
         Line2D([], [], color=MODES[0], lw=2, label=f"collision-free: {int(clear.sum())}"),
         Line2D([], [], color=DANGER, lw=2, label=f"in collision: {int((~clear).sum())}"),
     ]
-    legend(scene, handles=handles, loc="lower left", ncols=2)
-    draw_curves(figure.add_subplot(grid[1]), artifact)
+    legend_above(scene, handles)
+    losses, validation = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    draw_losses(losses, artifact)
+    draw_validation(validation, artifact)
     target = artifact.header.config["planner"]["_target_"].rpartition(".")[2]
     headline(
         figure,
         f"{target} planner: {100 * clear.mean():.0f} % of its plans are collision-free",
-        f"{artifact.header.experiment}, {SAMPLES} samples from starts drawn in X_I, K = {references.shape[1] - 1}; "
+        f"{artifact.header.experiment}, {SAMPLES} samples from starts drawn in X$_I$, K = {references.shape[1] - 1}; "
         f"{100 * reaches.mean():.0f} % end in the goal box; open loop, nothing tracks them",
     )
     return figure

@@ -19,7 +19,7 @@ from sagemp_cli.report.canvas import (
     draw_start,
     goal_at_end,
     headline,
-    legend,
+    legend_above,
     style_axes,
 )
 from sagemp_cli.storage import Artifact, Library, Rollouts
@@ -51,36 +51,36 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
     for r in np.unique(chosen):
         mine, colour = tubes.cell_reference == r, MODES[r % len(MODES)]
         lower, upper = tubes.tube_lower[mine].min(0), tubes.tube_upper[mine].max(0)
-        draw_boxes(scene, lower[:, plane], upper[:, plane], facecolors=colour, edgecolors="none", alpha=0.07, zorder=2.7)
-        draw_paths(
-            scene, record.states[some[chosen[some] == r]][..., plane], colors=colour, linewidths=0.5, alpha=alpha, zorder=4
-        )
+        states = record.states[some[chosen[some] == r]]
+        low, high = lower[:, plane], upper[:, plane]
+        draw_boxes(scene, low, high, facecolors=colour, edgecolors="none", alpha=0.07, zorder=2.7)
+        draw_paths(scene, states[..., plane], colors=colour, linewidths=0.5, alpha=alpha, zorder=4)
         for i, axes in enumerate(panels):
             axes.fill_between(times, lower[:, i], upper[:, i], color=colour, alpha=0.12, linewidth=0)
-            curves = record.states[some[chosen[some] == r]][..., i]
+            curves = states[..., i]
             lines = np.stack([np.broadcast_to(times, curves.shape), curves], axis=-1)
             draw_paths(axes, lines, colors=colour, linewidths=0.4, alpha=alpha)
     escaped = record.states[~record.in_tube]
     draw_paths(scene, escaped[..., plane], colors=DANGER, linewidths=1.2, zorder=8)
-    draw_paths(scene, record.sampled_references[..., plane], colors=MUTED, linewidths=0.6, linestyles=(0, (4, 3)), zorder=3.5)
+    proposals = record.sampled_references[..., plane]
+    draw_paths(scene, proposals, colors=MUTED, linewidths=0.6, linestyles=(0, (4, 3)), zorder=3.5)
     for i, axes in enumerate(panels):
         axes.autoscale_view()
         axes.set_xlim(0, times[-1])
         goal_at_end(axes, setting, i, times[-1])
     panels[-1].set_xlabel("time (s)", fontsize=9.5)
-    handles = [
-        Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks reference {i}") for i in np.unique(chosen)
-    ]
+    handles = [Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks {i}") for i in np.unique(chosen)]
     handles.append(Line2D([], [], color=MUTED, lw=1, ls=(0, (4, 3)), label="planner's proposal"))
-    legend(scene, handles=handles, loc="lower left", ncols=min(3, len(handles)))
+    legend_above(scene, handles)
 
     inside, safe = int(record.in_tube.sum()), int(record.safe.sum())
     text = "All" if inside == total else f"Only {inside} of"
     headline(
         figure,
         f"{text} {total} rollouts stayed in their tube",
-        f"{artifact.header.experiment}: {len(record.chosen)} starts measured in X$_I$, closest of {len(tubes.references)} certified "
-        f"references tracked (mean E = {record.reference_error.mean():.3g}); random and worst-case disturbances; "
+        f"{artifact.header.experiment}: {len(record.chosen)} starts measured in X$_I$, closest of "
+        f"{len(tubes.references)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
+        "random and worst-case disturbances; "
         f"{safe} of {total} kept clear and reached the goal",
         colour=SAFE if inside == total else DANGER,
     )

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sagemp_cli.report.canvas import INK, MODES, MUTED, blank_figure, headline, legend, style_axes
 from sagemp_cli.storage import Artifact, PlannerModel, TrackerModel
 
+_VALIDATION = "validation "
+
 
 def draw_training(artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> Figure:
-    """Every recorded figure over the updates: faint as measured, strong as a running mean."""
+    """Losses over the updates, faint as measured and strong as a running mean; the model card beside them."""
     record = artifact.record
-    figure = blank_figure(9.5, 4.6)
-    axes = figure.add_subplot()
-    draw_curves(axes, artifact)
-    text = "\n".join(f"{n}   {v:.4g}" for n, v in zip(record.figure_names, record.figures, strict=True))
-    axes.text(
-        0.985, 0.97, text, transform=axes.transAxes, ha="right", va="top", fontsize=8.5, color=INK, family="monospace"
-    )
+    figure = blank_figure(9.5, 4.4)
+    grid = figure.add_gridspec(1, 2, width_ratios=(2.6, 1))
+    draw_losses(figure.add_subplot(grid[0]), artifact)
+    card = figure.add_subplot(grid[1])
+    card.axis("off")
+    card.set_title("at the end", fontsize=10, color=INK, loc="left")
+    for i, (name, value) in enumerate(zip(record.figure_names, record.figures, strict=True)):
+        y = 0.96 - 0.075 * i
+        card.text(0.0, y, name, transform=card.transAxes, fontsize=9, color=MUTED, va="top")
+        card.text(1.0, y, f"{value:.4g}", transform=card.transAxes, fontsize=9, color=INK, va="top", ha="right")
     what = artifact.header.stage.replace("train-", "")
     parameters = sum(int(np.prod(w.shape)) for w in record.weights.values())
     headline(
@@ -30,26 +38,40 @@ def draw_training(artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> 
     return figure
 
 
-def draw_curves(axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> None:
-    """The curves that are positive throughout, on a logarithmic axis."""
+def draw_losses(axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> None:
+    """What every update measured and is positive, on a logarithmic axis."""
     curve = artifact.record.curve
     style_axes(axes, xlabel="update", ylabel="loss")
-    shown = [
-        (name, column)
-        for name, column in zip(curve.names, curve.values.T, strict=True)
-        if name == "loss" or (np.isfinite(column).any() and (column[np.isfinite(column)] > 0).all())
-    ]
-    for i, (name, column) in enumerate(shown):
-        colour, measured = MODES[i % len(MODES)], np.isfinite(column)
-        x, y = curve.step[measured], column[measured]
-        if len(y) < 0.5 * len(column) or len(y) < 50:
-            axes.plot(x, y, color=colour, linewidth=1.6, marker="o", markersize=3, label=name)
-            continue
-        axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.3)
-        window = max(1, len(y) // 50)
+    losses = [i for i, name in enumerate(curve.names) if not name.startswith(_VALIDATION)]
+    shown = [i for i in losses if _positive(curve.values[:, i])]
+    for colour, i in zip(MODES, shown, strict=False):
+        measured = np.isfinite(curve.values[:, i])
+        x, y = curve.step[measured], curve.values[measured, i]
+        window = max(1, len(y) // 40)
         smooth = np.convolve(y, np.ones(window) / window, mode="valid")
-        axes.plot(x[window - 1 :], smooth, color=colour, linewidth=1.6, label=name)
-    if all((column[np.isfinite(column)] > 0).all() for _, column in shown):
+        axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.3)
+        axes.plot(x[window - 1 :], smooth, color=colour, linewidth=1.6, label=curve.names[i])
+    if shown:
         axes.set_yscale("log")
-    axes.grid(color=MUTED, alpha=0.15, which="minor", linewidth=0.4)
-    legend(axes, loc="lower left", ncols=3)
+        axes.grid(color=MUTED, alpha=0.15, which="minor", linewidth=0.4)
+        legend(axes, loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=len(shown), borderaxespad=0.1, fontsize=8)
+
+
+def draw_validation(axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> None:
+    """The validation's figures, shares and distances alike, on one axis from 0."""
+    curve = artifact.record.curve
+    style_axes(axes, xlabel="update", ylabel="validation")
+    names: Sequence[str] = [name for name in curve.names if name.startswith(_VALIDATION)]
+    for colour, name in zip(MODES, names, strict=False):
+        column = curve.values[:, curve.names.index(name)]
+        measured = np.isfinite(column)
+        style = {"color": colour, "linewidth": 1.4, "marker": "o", "markersize": 3}
+        axes.plot(curve.step[measured], column[measured], label=name.removeprefix(_VALIDATION), **style)
+    axes.set_ylim(0, 1.05)
+    if names:
+        legend(axes, loc="center right", fontsize=7.5)
+
+
+def _positive(column: np.ndarray) -> bool:
+    found = column[np.isfinite(column)]
+    return len(found) > 0 and bool((found > 0).all())

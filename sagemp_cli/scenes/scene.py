@@ -95,14 +95,14 @@ class Scene:
         return ("workspace", *(o.name for o in self.obstacles))
 
 
-def _numbers(where: str, values: Any, size: int | None = None) -> tuple[float, ...]:
+def _numbers(where: str, values: Any, size: int) -> tuple[float, ...]:
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise ConfigError(f"{where} must be a list of numbers, found {values!r}")
     try:
         out = tuple(float(v) for v in values)
     except (TypeError, ValueError):
         raise ConfigError(f"{where} must be a list of numbers, found {list(values)!r}") from None
-    if size is not None and len(out) != size:
+    if len(out) != size:
         raise ConfigError(f"{where} needs {size} numbers, found {len(out)}")
     if any(v != v for v in out):
         raise ConfigError(f"{where} contains NaN")
@@ -114,36 +114,59 @@ def scene_from_mapping(data: Mapping[str, Any], *, state_dim: int, position_dim:
 
     Keys: ``workspace {lower, upper}``, ``obstacles`` (a list of ``{kind: ball, center, radius, name}`` or
     ``{kind: block, lower, upper, name}``) and ``goal {lower, upper}`` over the state (``-inf``/``inf`` allowed).
+
+    Raises:
+        ConfigError: an unknown or missing key, or a value that is not what it should be.
     """
+    _require_keys("scene", data, ("workspace", "obstacles", "goal"), ("name", "description"))
+    if not isinstance(data["obstacles"], Sequence) or isinstance(data["obstacles"], str):
+        raise ConfigError(f"scene.obstacles must be a list, found {data['obstacles']!r}")
+    return Scene(
+        _box("scene.workspace", data["workspace"], position_dim),
+        tuple(_obstacle(f"scene.obstacles[{i}]", item, i, position_dim) for i, item in enumerate(data["obstacles"])),
+        _box("scene.goal", data["goal"], state_dim),
+    )
+
+
+def _obstacle(where: str, item: Any, index: int, size: int) -> Obstacle:
+    kind = item.get("kind") if isinstance(item, Mapping) else None
+    if kind == "ball":
+        _require_keys(where, item, ("kind", "center", "radius"), ("name",))
+        center = _finite(f"{where}.center", item["center"], size)
+        (radius,) = _finite(f"{where}.radius", [item["radius"]], 1)
+        if radius <= 0:
+            raise ConfigError(f"{where}.radius must be a positive number, found {item['radius']!r}")
+        return Ball(center, radius, str(item.get("name", f"obstacle {index}")))
+    if kind == "block":
+        _require_keys(where, item, ("kind", "lower", "upper"), ("name",))
+        low, high = _numbers(f"{where}.lower", item["lower"], size), _numbers(f"{where}.upper", item["upper"], size)
+        if any(a >= b for a, b in zip(low, high, strict=True)):
+            raise ConfigError(f"{where}: lower must lie below upper, found {list(low)} and {list(high)}")
+        return Block(low, high, str(item.get("name", f"obstacle {index}")))
+    raise ConfigError(f"{where}.kind must be 'ball' or 'block', found {kind!r}")
+
+
+def _box(where: str, part: Any, size: int) -> Box:
+    _require_keys(where, part, ("lower", "upper"))
+    low, high = _numbers(f"{where}.lower", part["lower"], size), _numbers(f"{where}.upper", part["upper"], size)
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise ConfigError(f"{where}: lower must not exceed upper, found {list(low)} and {list(high)}")
+    return Box(torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64))
+
+
+def _require_keys(where: str, data: Any, needed: Sequence[str], allowed: Sequence[str] = ()) -> None:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where} must be a mapping with {', '.join(needed)}, found {data!r}")
     for key in data:
-        if key not in ("workspace", "obstacles", "goal", "name", "description"):
-            raise ConfigError(f"scene: unknown key '{key}'{did_you_mean(key, ('workspace', 'obstacles', 'goal'))}")
-    for key in ("workspace", "obstacles", "goal"):
+        if key not in needed and key not in allowed:
+            raise ConfigError(f"{where}: unknown key '{key}'{did_you_mean(str(key), (*needed, *allowed))}")
+    for key in needed:
         if key not in data:
-            raise ConfigError(f"scene: key '{key}' is missing")
+            raise ConfigError(f"{where}: key '{key}' is missing")
 
-    def box(key: str, size: int) -> Box:
-        part = data[key]
-        return Box(
-            torch.tensor(_numbers(f"scene.{key}.lower", part.get("lower"), size), dtype=torch.float64),
-            torch.tensor(_numbers(f"scene.{key}.upper", part.get("upper"), size), dtype=torch.float64),
-        )
 
-    obstacles: list[Obstacle] = []
-    for i, item in enumerate(data["obstacles"]):
-        where, kind = f"scene.obstacles[{i}]", item.get("kind")
-        name = str(item.get("name", f"obstacle {i}"))
-        if kind == "ball":
-            radius = float(item.get("radius", -1.0))
-            if not 0 < radius < float("inf"):
-                raise ConfigError(f"{where}.radius must be a positive number, found {item.get('radius')!r}")
-            obstacles.append(Ball(_numbers(f"{where}.center", item.get("center"), position_dim), radius, name))
-        elif kind == "block":
-            low = _numbers(f"{where}.lower", item.get("lower"), position_dim)
-            high = _numbers(f"{where}.upper", item.get("upper"), position_dim)
-            if any(a >= b for a, b in zip(low, high, strict=True)):
-                raise ConfigError(f"{where}: lower must lie below upper")
-            obstacles.append(Block(low, high, name))
-        else:
-            raise ConfigError(f"{where}.kind must be 'ball' or 'block', found {kind!r}")
-    return Scene(box("workspace", position_dim), tuple(obstacles), box("goal", state_dim))
+def _finite(where: str, values: Any, size: int) -> tuple[float, ...]:
+    numbers = _numbers(where, values, size)
+    if any(abs(v) == float("inf") for v in numbers):
+        raise ConfigError(f"{where} must be finite, found {values!r}")
+    return numbers

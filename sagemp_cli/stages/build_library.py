@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,13 @@ from torch import Tensor
 from sagemp_cli.binding import build
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.library import REASONS, build_library
+from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.reachability.verification import verify_references
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.library import draw_library
 from sagemp_cli.sets import Box
-from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.stages.options import whole_number
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.stage import StageContext

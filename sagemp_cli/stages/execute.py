@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from sagemp_cli.execution import execute_queries
+from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.rollouts import draw_rollouts
-from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.stages.options import whole_number
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.stage import StageContext

@@ -9,7 +9,9 @@ from typing import Any
 from sagemp_cli.errors import ConfigError, did_you_mean
 
 
-def options_for(function: Callable[..., Any], section: Any, where: str, *, given: tuple[str, ...] = ()) -> dict[str, Any]:
+def options_for(
+    function: Callable[..., Any], section: Any, where: str, *, given: tuple[str, ...] = ()
+) -> dict[str, Any]:
     """The section's entries if ``function`` takes them all; an option is never silently ignored.
 
     Args:

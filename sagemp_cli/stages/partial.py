@@ -78,7 +78,7 @@ class PartialResults:
         """
         path = self._path(index)
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
         except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError) as e:
             path.unlink(missing_ok=True)

@@ -48,9 +48,7 @@ def problem_of(config: Mapping[str, Any]) -> Problem:
     center = _numbers("start.center", config["start"].get("center"), n)
     radius = _radius("start.radius", config["start"].get("radius"), names)
     if not any(radius):
-        raise ConfigError(
-            f"start.radius must be positive in at least one of {', '.join(names)}; found {radius}, a start box of zero width"
-        )
+        raise ConfigError(f"start.radius must be positive in at least one of {', '.join(names)}; found {radius}")
     disturbance = _radius("disturbance.radius", config["disturbance"].get("radius"), names)
     return Problem(
         dynamics=dynamics,

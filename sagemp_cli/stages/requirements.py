@@ -2,34 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from sagemp_cli.config import all_complaints
-from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.binding import all_complaints, option_complaints, target_class
+from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
+from sagemp_cli.experts import Expert, Weights
+from sagemp_cli.planners import train_planner
 from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
+from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.trackers.losses import LossWeights
+from sagemp_cli.trackers.training import train_tracker
+from sagemp_cli.trackers.tube_loss import TubeLoss
+
+_RUN = ("generator", "checkpoint", "identity", "progress")
+"""Arguments of everything that trains or searches, which the stages give."""
+
+_KEYS = {
+    "verify": ("partitions", "references", "falsifier"),
+    "library": ("size", "budget", "start_spread"),
+    "execute": ("queries", "rollouts"),
+    "start": ("center", "radius"),
+    "disturbance": ("radius",),
+}
+"""Keys of the sections that the stages read one by one."""
 
 
 def require_sound_config(config: Mapping[str, Any]) -> None:
-    """Check that every section fits its class, that the problem is well posed and that the partition is one.
+    """Check that every section fits what it configures, that the problem is well posed and the partition is one.
 
     Raises:
         ConfigError: one line with every complaint.
     """
-    found = all_complaints(config)
+    found = [*all_complaints(config), *_option_complaints(config)]
     if not any(complaint.startswith("dynamics") for complaint in found):
-        try:
-            problem = problem_of(config)
-            _require_partition(config["verify"]["partitions"], len(uncertain_dimensions(problem.start)))
-        except UsageError as e:
-            found.append(str(e))
+        found += _problem_complaints(config)
     if found:
         raise ConfigError("; ".join(found))
 
 
-def _require_partition(value: Any, uncertain: int) -> None:
+def _option_complaints(config: Mapping[str, Any]) -> Iterator[str]:
+    """Options of functions and of classes that the stages call by name."""
+    expert = _without(config["expert"], "count", "processes", "weights")
+    yield from option_complaints(Expert, expert, "expert", given=("dynamics", "scene", "horizon", "weights"))
+    yield from option_complaints(Weights, config["expert"].get("weights"), "expert.weights")
+
+    training = config["planner_training"]
+    given = ("planner", "demonstrations", "held_out", "scene", "position", *_RUN)
+    yield from option_complaints(train_planner, _without(training, "held_out"), "planner_training", given=given)
     try:
-        parse_partitions(value, uncertain)
+        loss = target_class(config["planner"], "planner").loss_type
+    except ConfigError:
+        pass  # the section's own complaint
+    else:
+        given = ("planner", "demonstrations", "steps")
+        yield from option_complaints(loss, training.get("loss"), "planner_training.loss", given=given)
+
+    training = config["training"]
+    given = ("tracker", "dynamics", "references", "start", "disturbance", "tube", *_RUN)
+    yield from option_complaints(train_tracker, _without(training, "references", "tube"), "training", given=given)
+    yield from option_complaints(LossWeights, training.get("weights"), "training.weights")
+    if training.get("tube") is not None:
+        yield from option_complaints(TubeLoss, training["tube"], "training.tube")
+
+    given = ("verification", "dynamics", "tracker", "scene", *_RUN)
+    yield from option_complaints(attack, config["verify"].get("falsifier"), "verify.falsifier", given=given)
+    for section, known in _KEYS.items():
+        for key in config[section]:
+            if key not in known:
+                near = did_you_mean(str(key), known) or f"; known: {', '.join(known)}"
+                yield f"{section}.{key}: no such option{near}"
+
+
+def _problem_complaints(config: Mapping[str, Any]) -> list[str]:
+    try:
+        problem = problem_of(config)
     except UsageError as e:
-        raise ConfigError(f"verify.{e}") from None
+        return [str(e)]
+    try:
+        parse_partitions(config["verify"]["partitions"], len(uncertain_dimensions(problem.start)))
+    except UsageError as e:
+        return [f"verify.{e}"]
+    return []
+
+
+def _without(section: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {k: v for k, v in section.items() if k not in keys}

@@ -71,4 +71,3 @@ def run(context: StageContext) -> Path:
     partial.remove()
     draw_beside(path, draw_training, context.read("train-tracker"))
     return path
-

@@ -50,7 +50,7 @@ def verification_of(record: Tubes, where: str) -> Verification:
     owner = record.cell_reference
     cells = len(owner) // max(count, 1)
     if count == 0 or cells * count != len(owner) or not np.array_equal(owner, np.repeat(np.arange(count), cells)):
-        raise ArtifactError(f"{where}: /data/tubes/cell_reference must list equally many cells of each reference in order")
+        raise ArtifactError(f"{where}: /data/tubes/cell_reference must list equally many cells of each reference")
     unknown = [x for x in record.verdict if x not in list(Outcome)]
     if unknown:
         raise ArtifactError(f"{where}: /data/tubes/verdict holds '{unknown[0]}'; known: {', '.join(Outcome)}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sagemp_cli.binding import build
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.reachability.falsifier import Counterexample as Found
 from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
@@ -13,7 +14,6 @@ from sagemp_cli.reachability.verdict import answer_of
 from sagemp_cli.reachability.verification import verify_references
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.stages.options import options_for, whole_number
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.stage import StageContext
@@ -43,7 +43,8 @@ def run(context: StageContext) -> Path:
         generator=context.generator("verify: references"),
     )
     if references.shape[1] != problem.horizon + 1:
-        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {references.shape[1] - 1} steps")
+        found = references.shape[1] - 1
+        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {found} steps")
     verification = verify_references(
         propagator,
         problem.dynamics,

@@ -47,7 +47,7 @@ class RolloutSampler:
     spread: Tensor
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """References ``(count, H+1.., n)`` shifted to their first step, starts ``(count, n)``, disturbances ``(count, H, n)``."""
+        """References ``(count, K+1, n)`` from their first step on, starts ``(count, n)``, disturbances ``(count, H, n)``."""
         total, horizon = self.references.shape[0], self.references.shape[1] - 1
         chosen = torch.randint(total, (count,), generator=generator)
         shift = torch.randint(max(1, horizon - self.length // 2), (count,), generator=generator)
@@ -82,7 +82,7 @@ def train_tracker(
     learning_rate: float = 5e-3,
     weights: Mapping[str, float] | None = None,
     tube: TubeLoss | None = None,
-    tube_from: float = 0.4,
+    tube_steps: int = 150,
     checkpoint: Path | None = None,
     identity: str = "",
     progress: Progress | None = None,
@@ -102,7 +102,7 @@ def train_tracker(
         learning_rate: peak learning rate.
         weights: ``track``, ``state``, ``control`` of :class:`LossWeights`.
         tube: reachability-aware part, None for the paper's plain loss.
-        tube_from: share of the steps after which the tube's width enters.
+        tube_steps: further gradient steps with the reachability-aware part, from the plainly trained tracker.
         checkpoint, identity, progress: see :func:`sagemp_cli.training.fit`.
     """
     horizon = references.shape[1] - 1
@@ -111,27 +111,40 @@ def train_tracker(
     loss_weights = LossWeights(**(weights or {}))
     spread = 0.05 * (dynamics.state_upper - dynamics.state_lower)
     sampler = RolloutSampler(references, start, disturbance, rollout_steps, spread)
-    first = int(steps * tube_from)
 
-    def loss(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    def plain(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Tracker)
         drawn, x, w = sampler.draw(batch, generator)
         states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
-        value, figures = rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : rollout_steps + 1], loss_weights)
-        if tube is not None and step >= first:
-            progress_share = (step - first) / max(1, steps - 1 - first)
-            width, more = tube(module, dynamics, references, start, disturbance, progress_share, generator)
-            value, figures = value + width, figures | more
-        return value, figures
+        return rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : rollout_steps + 1], loss_weights)
 
-    return fit(
-        tracker,
-        loss,
-        steps=steps,
-        learning_rate=learning_rate,
-        generator=generator,
-        checkpoint=checkpoint,
-        identity=identity,
-        progress=progress,
-        description="training the tracker",
+    def with_tube(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        assert isinstance(module, Tracker) and tube is not None
+        value, figures = plain(module, step, generator)
+        share = step / max(1, tube_steps - 1)
+        width, more = tube(
+            module,
+            dynamics,
+            references=references,
+            start=start,
+            disturbance=disturbance,
+            share=share,
+            generator=generator,
+        )
+        return value + width, figures | more
+
+    common = {"learning_rate": learning_rate, "generator": generator, "identity": identity, "progress": progress}
+    history = fit(tracker, plain, steps=steps, checkpoint=checkpoint, description="training the tracker", **common)
+    if tube is None:
+        return history
+    later = None if checkpoint is None else checkpoint.with_name(f"{checkpoint.stem}-tube{checkpoint.suffix}")
+    return history.then(
+        fit(
+            tracker,
+            with_tube,
+            steps=tube_steps,
+            checkpoint=later,
+            description="training the tracker on its tubes",
+            **common,
+        )
     )

@@ -40,13 +40,13 @@ class TubeLoss:
     """
 
     weight: float = 0.3
-    references: int = 2
+    references: int = 6
     counts: Sequence[int] = (2, 2)
-    steps: int = 100
-    symbols: int = 80
+    steps: int = 60
+    symbols: int = 50
     scale: Sequence[float] | float = 0.1
     end: float = 1.0
-    shrink: float = 0.2
+    shrink: float = 0.25
 
     def __post_init__(self) -> None:
         if not 0 < self.shrink <= 1:
@@ -56,6 +56,7 @@ class TubeLoss:
         self,
         tracker: Tracker,
         dynamics: Dynamics,
+        *,
         references: Tensor,
         start: Box,
         disturbance: Box,

@@ -18,11 +18,13 @@ def scene():
 def curves(count, seed):
     """States ``(count, K+1, 4)`` on curves that pass above the disc if they start above, else below.
 
-    The path is ``y = y0 (1 - s)^2 + side 1.8 sin(pi s)^2``, ``x = x0 + (8 - x0) s``; heading and speed are its own.
+    No curve starts near the x axis, so a smooth field can tell the sides apart. The path is
+    ``y = y0 (1 - s)^2 + side 1.8 sin(pi s)^2``, ``x = x0 + (8 - x0) s``; heading and speed are its own.
     """
     generator = torch.Generator().manual_seed(seed)
     x0 = -0.5 + torch.rand(count, 1, dtype=torch.float64, generator=generator)
-    y0 = 2 * torch.rand(count, 1, dtype=torch.float64, generator=generator) - 1
+    y0 = 0.8 * torch.rand(count, 1, dtype=torch.float64, generator=generator) - 0.4
+    y0 = y0 + 0.4 * torch.sign(y0)
     s = torch.linspace(0, 1, HORIZON + 1, dtype=torch.float64)
     side = torch.where(y0 >= 0, 1.0, -1.0)
     x = x0 + (8 - x0) * s

@@ -163,6 +163,6 @@ def test_wrong_starts_are_named():
 def test_an_overflow_is_reported():
     made = planner()
     with torch.no_grad():
-        made.field.rest[-1].bias.fill_(1e38)
+        made.field.rest[-1].bias.fill_(float("inf"))
     with pytest.raises(NonFiniteError, match="sampled reference contains NaN or infinity"):
         sample(made, torch.zeros(2), 1)

@@ -61,7 +61,10 @@ def test_a_collision_comes_before_a_missed_goal():
     assert found.verdicts == (Verdict(Outcome.MAY_COLLIDE, 0, "disc"),)
 
 
-@pytest.mark.parametrize(("low", "high"), [(-math.inf, math.inf), (math.inf, math.inf), (math.nan, math.nan), (0.0, math.inf)])
+INF, NAN = math.inf, math.nan
+
+
+@pytest.mark.parametrize(("low", "high"), [(-INF, INF), (INF, INF), (NAN, NAN), (0.0, INF)])
 def test_an_overflow_is_unbounded_wherever_it_points(low, high):
     t = tube(CLEAR, CLEAR, GOAL)
     t.lower[0, 0, 1, 1], t.upper[0, 0, 1, 1] = low, high
@@ -90,11 +93,13 @@ def test_one_bad_cell_decides_and_references_are_judged_apart():
 def test_cells_that_are_clear_are_safe_although_their_hull_collides():
     left, right = (-4.0, -1.5, 4.0, 6.0), (1.5, 4.0, 4.0, 6.0)
     a, b = tube(left, GOAL), tube(right, GOAL)
-    assert judge(Tube(torch.cat([a.lower, b.lower], 1), torch.cat([a.upper, b.upper], 1))).verdicts[0].outcome is Outcome.SAFE
+    both = Tube(torch.cat([a.lower, b.lower], 1), torch.cat([a.upper, b.upper], 1))
+    assert judge(both).verdicts[0].outcome is Outcome.SAFE
 
 
 def test_the_answer_for_all_references():
-    safe, maybe, bad = Verdict(Outcome.SAFE), Verdict(Outcome.MISSES_GOAL, 3, "goal px"), Verdict(Outcome.UNSAFE, 3, "disc")
+    safe, maybe = Verdict(Outcome.SAFE), Verdict(Outcome.MISSES_GOAL, 3, "goal px")
+    bad = Verdict(Outcome.UNSAFE, 3, "disc")
     assert answer_of([safe, safe]) is Answer.VERIFIED
     assert answer_of([safe, maybe]) is Answer.UNKNOWN
     assert answer_of([maybe, bad, safe]) is Answer.FALSIFIED

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 UNIT = 2.0**-53
@@ -17,8 +19,26 @@ class Band(NamedTuple):
     """``|f(x) - slope x - offset| <= radius`` for every real x of the interval, in real arithmetic.
 
     ``slope``, ``offset`` and ``radius >= 0`` are the exact float64 numbers stored; all rounding made in finding them is inside ``radius``.
+    A band that claims nothing has an infinite radius, slope 0 and offset 0.
     """
 
     slope: Tensor
     offset: Tensor
     radius: Tensor
+
+
+def settled(slope: Tensor, offset: Tensor, radius: Tensor) -> Band:
+    """The band, which claims nothing where its radius came out as NaN or infinite.
+
+    Every relaxation's radius is not finite if the interval or anything computed from it is not, so the radius alone is asked:
+    one sum in the usual case.
+    """
+    if math.isfinite(radius.detach().sum().item()):
+        return Band(slope, offset, radius)
+    finite = torch.isfinite(radius)
+    zero = torch.zeros_like(radius)
+    return Band(
+        torch.where(finite, slope, zero),
+        torch.where(finite, offset, zero),
+        torch.where(finite, radius, torch.full_like(radius, math.inf)),
+    )

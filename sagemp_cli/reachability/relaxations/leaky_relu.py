@@ -1,11 +1,14 @@
-"""Leaky ReLU (and ReLU, slope 0): ``f(x) = max(x, s x)``, ``0 <= s < 1``."""
+"""Leaky ReLU (and ReLU, slope 0): ``f(x) = max(x, s x)``, ``s <= 1``; a negative s is allowed (-1 gives the absolute value)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
+from sagemp_cli.reachability.relaxations import lines as _lines
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.reachability.relaxations.value_range import increasing
 
 
 def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None = None) -> Band:
@@ -14,19 +17,37 @@ def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | No
     For every slope ``a`` in ``[s, 1]``: ``f(x) - a x`` lies between 0 (at the kink) and
     ``max((s - a) lower, (1 - a) upper)`` (at the ends), so the band is exact up to rounding, whatever ``a``.
     """
-    low, high = lower.clamp(max=0.0), upper.clamp(min=0.0)
-    if slope is None:
-        chord = (high - negative_slope * low) / (high - low + TINY)
-        slope = chord.clamp(negative_slope, 1.0)
-        slope = torch.where(lower >= 0, torch.ones_like(slope), slope)
-        slope = torch.where(upper <= 0, torch.full_like(slope, negative_slope), slope)
-    gap = torch.maximum((negative_slope - slope) * low, (1.0 - slope) * high)
+    slope, gap = _chord_and_gap(lower, upper, negative_slope, slope)
     # Two roundings in the gap and one in the half: 4 UNIT; an upper bound of the gap gives an upper bound of both halves.
     half = gap * (0.5 + 4 * UNIT)
-    return Band(slope, half, half)
+    return settled(slope, half, half)
+
+
+def lines(lower: Tensor, upper: Tensor, negative_slope: float) -> Lines:
+    """Above the chord; below the one of the two rays ``x`` and ``s x`` on whose side more of the interval lies."""
+    slope, gap = _chord_and_gap(lower, upper, negative_slope, None)
+    one = torch.ones_like(slope)
+    below = torch.where(upper >= -lower, one, negative_slope * one)
+    below = torch.where((lower >= 0) | (upper <= 0), slope, below)
+    return _lines.settled(Lines(below, torch.zeros_like(slope), slope, gap * (1.0 + 4 * UNIT)))
 
 
 def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Tensor, Tensor]:
-    """Monotone: the values at the ends (the product is rounded outwards by the caller's margin)."""
-    leaky = torch.nn.functional.leaky_relu
-    return leaky(lower, negative_slope), leaky(upper, negative_slope)
+    """Bounds on ``[lower, upper]``, ``0 <= s``: monotone, so the values at the ends."""
+    return increasing(lambda x: torch.nn.functional.leaky_relu(x, negative_slope), lower, upper, ulps=1)
+
+
+def _chord_and_gap(
+    lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """The chord's slope (if none is given) and the largest ``f(x) - slope x``.
+
+    Ends on the far side of the kink are moved to the kink, or just past it: then no product below can underflow and no quotient is 0/0.
+    """
+    low, high = lower.clamp(max=-TINY), upper.clamp(min=TINY)
+    if slope is None:
+        chord = (high - negative_slope * low) / (high - low)
+        slope = chord.clamp(negative_slope, 1.0)
+        slope = torch.where(lower >= 0, torch.ones_like(slope), slope)
+        slope = torch.where(upper <= 0, torch.full_like(slope, negative_slope), slope)
+    return slope, torch.maximum((negative_slope - slope) * low, (1.0 - slope) * high)

@@ -2,65 +2,203 @@
 
 With slope ``a`` the excess ``e(x) = sin x - a x`` has its local maxima at ``t + 2 pi k`` and its local minima at
 ``-t + 2 pi k`` with ``t = acos a``. Their values are linear in ``k``, so of all the extrema inside an interval only
-the first and the last can decide, and the band is exact up to rounding on intervals of any width.
+the first and the last can decide, and the band is exact up to rounding on intervals of any width, for any slope.
+
+The slope. Between two inflections the chord is best. Across one, where the graph is S-shaped, the best line is the
+tangent drawn from the end farther from the inflection; it touches about half as far on the other side (exactly so for a
+cubic), so the chord from that end to there is as good to higher order. Wide intervals go through a search.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.relaxations.band import UNIT, Band
+from sagemp_cli.reachability.relaxations import lines as _lines
+from sagemp_cli.reachability.relaxations.band import UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.reachability.relaxations.pieces import (
+    Excess,
+    Objective,
+    best_slope,
+    lower_objective,
+    radius_objective,
+    upper_objective,
+)
 
 ULPS = 4
-"""Margin, in ulps of 1, allowed to ``torch.sin``, ``torch.cos``, ``torch.acos`` in float64; tested against ball arithmetic."""
+"""Margin, in ulps of 1, allowed to ``torch.sin``, ``torch.cos``, ``torch.acos``, ``torch.asin``; tested against ball arithmetic."""
 
 _SLACK = 1e-7  # an extremum this far outside (in turns) is counted too: its excess exceeds the end's by at most (2 pi slack)^2 / 2
 _TWO_PI = 2.0 * math.pi
+_NARROW = 0.05  # rad: below, what an inflection costs (a third-order term) is not worth the time
+_WIDE = 2.5  # rad: above, the slope is searched
+_FAR = 2.0**40  # rad: beyond, rounding of the argument leaves nothing but [-1, 1]
+
+
+class _Wave(NamedTuple):
+    """Sine or cosine: value, derivative, where the excess has its maximum and minimum at a given slope, one inflection."""
+
+    value: Callable[[Tensor], Tensor]
+    derivative: Callable[[Tensor], Tensor]
+    turns: Callable[[Tensor], tuple[Tensor, Tensor]]
+    inflection: float
+
+
+def _sine_turns(slope: Tensor) -> tuple[Tensor, Tensor]:
+    turn = torch.acos(slope)
+    return turn, -turn
+
+
+def _cosine_turns(slope: Tensor) -> tuple[Tensor, Tensor]:
+    turn = torch.asin(slope)
+    return -turn, math.pi + turn
+
+
+_SINE = _Wave(torch.sin, torch.cos, _sine_turns, 0.0)
+_COSINE = _Wave(torch.cos, lambda x: -torch.sin(x), _cosine_turns, 0.5 * math.pi)
 
 
 def sine_band(lower: Tensor, upper: Tensor) -> Band:
     """Band of ``sin`` on ``[lower, upper]``."""
-    slope = _chord(torch.sin, torch.cos, lower, upper)
-    crest = torch.acos(slope)
-    return _band(torch.sin, slope, crest, -crest, lower, upper)
+    return _band(_SINE, lower, upper)
 
 
 def cosine_band(lower: Tensor, upper: Tensor) -> Band:
     """Band of ``cos`` on ``[lower, upper]``."""
-    slope = _chord(torch.cos, lambda x: -torch.sin(x), lower, upper)
-    turn = torch.asin(slope)
-    return _band(torch.cos, slope, -turn, math.pi + turn, lower, upper)
+    return _band(_COSINE, lower, upper)
 
 
-def _chord(f, df, lower: Tensor, upper: Tensor) -> Tensor:
-    """Slope of the chord where the interval is wide enough to have one, of the tangent where not; within [-1, 1]."""
+def sine_lines(lower: Tensor, upper: Tensor) -> Lines:
+    """Lines of ``sin`` on ``[lower, upper]``."""
+    return _lines_of(_SINE, lower, upper)
+
+
+def cosine_lines(lower: Tensor, upper: Tensor) -> Lines:
+    """Lines of ``cos`` on ``[lower, upper]``."""
+    return _lines_of(_COSINE, lower, upper)
+
+
+def sine_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of ``sin`` on ``[lower, upper]``."""
+    return _range(_SINE, lower, upper)
+
+
+def cosine_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of ``cos`` on ``[lower, upper]``."""
+    return _range(_COSINE, lower, upper)
+
+
+def _band(wave: _Wave, lower: Tensor, upper: Tensor) -> Band:
+    ends = torch.stack([lower, upper])
+    values = wave.value(ends)
     width = upper - lower
-    wide = width > 1e-6
-    chord = (f(upper) - f(lower)) / torch.where(wide, width, torch.ones_like(width))
-    return torch.where(wide, chord, df(0.5 * lower + 0.5 * upper)).clamp(-1.0, 1.0)
+    bent = (values[0] * values[1] < 0) & (width > _NARROW) | (width > _WIDE)
+    if bool(bent.any()):
+        slope = _chord(wave, *_shortened(wave, lower, upper))
+        wide = width > _WIDE
+        if bool(wide.any()):
+            slope = torch.where(wide, _searched(wave, ends, values, radius_objective), slope)
+    else:
+        slope = _chord(wave, lower, upper)
+    tops, bottoms, _ = _extrema(wave, slope, ends, values)
+    most, least = tops.amax(0), bottoms.amin(0)
+    size = ends.abs().amax(0)
+    offset, radius = 0.5 * (most + least), 0.5 * (most - least) + _margin(size)
+    if not bool((size <= _FAR).all()):
+        far = (size > _FAR) & torch.isfinite(ends).all(0)
+        zero = torch.zeros_like(size)
+        slope, offset = torch.where(far, zero, slope), torch.where(far, zero, offset)
+        radius = torch.where(far, zero + 1.0, radius)
+    return settled(slope, offset, radius)
 
 
-def _band(f, slope: Tensor, crest: Tensor, trough: Tensor, lower: Tensor, upper: Tensor) -> Band:
-    """Band with a given slope whose excess has its maxima at ``crest`` and its minima at ``trough`` (plus 2 pi k)."""
-    at_lower, at_upper = f(lower) - slope * lower, f(upper) - slope * upper
-    height = torch.sqrt((1.0 - slope) * (1.0 + slope))
-    most = _extreme(crest, height, slope, lower, upper, torch.maximum(at_lower, at_upper), torch.maximum)
-    least = _extreme(trough, -height, slope, lower, upper, torch.minimum(at_lower, at_upper), torch.minimum)
-    # Values err by ULPS ulps of 1 (sine), by 4 roundings of slope * x, and by the argument of the extrema (a few ulps
-    # of x, times |slope| <= 1; the excess is flat there). The offset's rounding is in the margin as well.
-    margin = (16 + 4 * ULPS) * UNIT * (8.0 + torch.maximum(lower.abs(), upper.abs()))
-    return Band(slope, 0.5 * (most + least), 0.5 * (most - least) + margin)
+def _lines_of(wave: _Wave, lower: Tensor, upper: Tensor) -> Lines:
+    ends = torch.stack([lower, upper])
+    values, middle = wave.value(ends), 0.5 * lower + 0.5 * upper
+    slopes = [_chord(wave, lower, upper), wave.derivative(middle)]
+    if bool(((values[0] * values[1] < 0) | (upper - lower > _WIDE)).any()):
+        slopes += [_searched(wave, ends, values, objective) for objective in (upper_objective, lower_objective)]
+    margin = _margin(ends.abs().amax(0))
+    best = Lines(*(torch.full_like(lower, fill) for fill in (0.0, -1.0, 0.0, 1.0)))
+    for slope in slopes:
+        tops, bottoms, _ = _extrema(wave, slope, ends, values)
+        best = _lines.choose(best, Lines(slope, bottoms.amin(0) - margin, slope, tops.amax(0) + margin), middle)
+    unknown = 0.0 * (lower + upper)  # NaN where an end is not finite
+    return _lines.settled(best._replace(upper_offset=best.upper_offset + unknown))
 
 
-def _extreme(base: Tensor, height: Tensor, slope: Tensor, lower: Tensor, upper: Tensor, ends: Tensor, pick) -> Tensor:
-    """The extreme of the excess over the ends and the extrema ``base + 2 pi k`` inside the interval."""
-    first = torch.ceil((lower - base) / _TWO_PI - _SLACK)
-    last = torch.floor((upper - base) / _TWO_PI + _SLACK)
-    values = pick(
-        height - slope * (base + _TWO_PI * first),
-        height - slope * (base + _TWO_PI * last),
+def _range(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    ends = torch.stack([lower, upper])
+    tops, bottoms, _ = _extrema(wave, torch.zeros_like(lower), ends, wave.value(ends))
+    near = ends.abs().amax(0) <= _FAR
+    margin = _margin(torch.zeros_like(lower))
+    one = torch.ones_like(lower)
+    return (
+        torch.where(near, torch.maximum(bottoms.amin(0) - margin, -one), -one),
+        torch.where(near, torch.minimum(tops.amax(0) + margin, one), one),
     )
-    return torch.where(first <= last, pick(ends, values), ends)
+
+
+def _margin(size: Tensor) -> Tensor:
+    """What an excess as computed may be off by.
+
+    The values by ULPS ulps of 1, ``slope * x`` and the difference by 4 roundings, and the argument of the extrema by a few
+    ulps of x (times ``|slope| <= 1``; the excess is flat there). The rounding of the offset is in it as well.
+    """
+    return (size + 8.0) * ((16 + 4 * ULPS) * UNIT)
+
+
+def _chord(wave: _Wave, lower: Tensor, upper: Tensor) -> Tensor:
+    """Slope of the chord ``f'(middle) sin(w / 2) / (w / 2)``, without cancellation at any width, in [-1, 1]."""
+    return wave.derivative(0.5 * lower + 0.5 * upper) * torch.sinc((upper - lower) * (1.0 / _TWO_PI))
+
+
+def _shortened(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """The interval, its shorter side of the inflection cut to half the longer one's length (if there is an inflection inside)."""
+    middle = 0.5 * lower + 0.5 * upper
+    center = wave.inflection + math.pi * torch.round((middle - wave.inflection) * (1.0 / math.pi))
+    left, right = center - lower, upper - center
+    return (
+        torch.where(left < right, torch.maximum(lower, center - 0.5 * right), lower),
+        torch.where(left < right, upper, torch.minimum(upper, center + 0.5 * left)),
+    )
+
+
+def _extrema(wave: _Wave, slope: Tensor, ends: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The excess at the ends and at the first and last local maximum (and minimum) inside: ``(4, ...)`` each, and the points.
+
+    Where none is inside, the last two of the four are infinite of the sign that never wins. The place of an extremum and its
+    height are taken as constants by autograd: the derivative of an extreme value with respect to the slope is minus its place.
+    """
+    with torch.no_grad():
+        base = torch.stack(wave.turns(slope))
+        height = torch.sqrt((1.0 - slope) * (1.0 + slope))
+        turns = (ends[:, None] - base) * (1.0 / _TWO_PI)
+        first, last = torch.ceil(turns[0] - _SLACK), torch.floor(turns[1] + _SLACK)
+        outside = first > last
+        points = base + _TWO_PI * torch.stack([first, last])
+    tilted = slope * points
+    at_ends = values - slope * ends
+    tops = torch.where(outside[0], -math.inf, height - tilted[:, 0])
+    bottoms = torch.where(outside[1], math.inf, -height - tilted[:, 1])
+    return torch.cat([at_ends, tops]), torch.cat([at_ends, bottoms]), points
+
+
+@torch.no_grad()
+def _searched(wave: _Wave, ends: Tensor, values: Tensor, objective: Objective) -> Tensor:
+    def evaluate(slope: Tensor) -> Excess:
+        tops, bottoms, points = _extrema(wave, slope, ends, values)
+        most, least = tops.max(0, keepdim=True), bottoms.min(0, keepdim=True)
+        return Excess(
+            least.values[0],
+            most.values[0],
+            torch.cat([ends, points[:, 1]]).gather(0, least.indices)[0],
+            torch.cat([ends, points[:, 0]]).gather(0, most.indices)[0],
+        )
+
+    return best_slope(evaluate, ends[0], ends[1], values=(values[0], values[1]), objective=objective, steepest=1.0)

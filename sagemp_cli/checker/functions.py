@@ -1,0 +1,188 @@
+"""How far a function's graph lies from a line, over an interval: the one fact that a relaxation rests on.
+
+``excess`` gives ``[least, most]`` that contains ``f(x) - slope x`` for every real x of ``[lower, upper]``. Nothing is
+assumed about how the slope was found. A function is a list of pieces, straight or smooth; a smooth piece is split
+until its curvature has one sign, where a tangent and a chord bound it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sagemp_cli.checker.balls import Unproved, arb, ball
+
+_MOST_SPLITS = 4096
+_NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Line:
+    """``a x + b``."""
+
+    a: arb
+    b: arb
+
+    def value(self, x: arb) -> arb:
+        """``f(x)``."""
+        return self.a * x + self.b
+
+    def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+        """See the module; exactly 0 if the line has this slope and passes through 0."""
+        ends = [(self.a - slope) * x + self.b for x in (lower, upper)]
+        return ends[0].min(ends[1]), ends[0].max(ends[1])
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A twice differentiable function: its value and its first two derivatives on balls."""
+
+    value: Callable[[arb], arb]
+    first: Callable[[arb], arb]
+    second: Callable[[arb], arb]
+
+    def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+        """See the module."""
+        todo, splits = [(lower, upper)], 0
+        ends = [self.value(x) - slope * x for x in (lower, upper)]
+        least, most = ends[0].min(ends[1]), ends[0].max(ends[1])
+        while todo:
+            low, high = todo.pop()
+            curvature = self.second(low.union(high))
+            if curvature >= 0:
+                least = least.min(self._tangent(slope, low, high, arb.min))
+            elif curvature <= 0:
+                most = most.max(self._tangent(slope, low, high, arb.max))
+            else:
+                splits += 1
+                if splits > _MOST_SPLITS:
+                    raise Unproved("an interval is too wide for a bound of its function")
+                middle = ((low + high) / 2).mid()
+                if (high - low) * ball(2.0**60) <= 1 + abs(middle):  # an inflection: bound it as it is
+                    whole, at = low.union(high), self.value(middle) - slope * middle
+                    spread = (self.first(whole) - slope) * (whole - middle)
+                    least, most = least.min((at + spread).lower()), most.max((at + spread).upper())
+                else:
+                    at = self.value(middle) - slope * middle
+                    least, most = least.min(at), most.max(at)
+                    todo += [(low, middle), (middle, high)]
+        return least, most
+
+    def _tangent(self, slope: arb, low: arb, high: arb, pick: Callable[[arb, arb], arb]) -> arb:
+        """The bound by a tangent of the excess, taken near its extremum (any point would be sound)."""
+        x = ((low + high) / 2).mid()
+        for _ in range(_NEWTON_STEPS):
+            bend = self.second(x)
+            if bend.contains(0):
+                break
+            step = ((self.first(x) - slope) / bend).mid()
+            x = (x - step).max(low).min(high).mid()
+        at, tilt = self.value(x) - slope * x, self.first(x) - slope
+        return pick(at + tilt * (low - x), at + tilt * (high - x))
+
+
+Piece = tuple[float | None, Line | Smooth, float | None]
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function made of pieces ``(from, what, to)``; None is no end. Pieces may overlap, as a limit does."""
+
+    pieces: tuple[Piece, ...]
+
+    def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+        """See the module."""
+        if not (slope.is_finite() and lower.is_finite() and upper.is_finite()):
+            raise Unproved("an interval is not finite")
+        found = None
+        for begin, piece, end in self.pieces:
+            low = lower if begin is None else lower.max(ball(begin))
+            high = upper if end is None else upper.min(ball(end))
+            if low > high:
+                continue
+            part = piece.excess(slope, low, high)
+            found = part if found is None else (found[0].min(part[0]), found[1].max(part[1]))
+        if found is None or not (found[0].is_finite() and found[1].is_finite()):
+            raise Unproved("an interval contains a pole, or leaves the domain of its function")
+        return found
+
+    def value(self, x: arb) -> arb:
+        """``f`` of a ball: the hull of the pieces that it meets."""
+        found = None
+        for begin, piece, end in self.pieces:
+            if (begin is not None and x < ball(begin)) or (end is not None and x > ball(end)):
+                continue
+            found = piece.value(x) if found is None else found.union(piece.value(x))
+        assert found is not None
+        return found
+
+
+def _smooth(value: Callable, first: Callable, second: Callable) -> Function:
+    return Function(((None, Smooth(value, first, second), None),))
+
+
+def _line(a: float, b: float = 0.0) -> Line:
+    return Line(ball(a), ball(b))
+
+
+def _sigmoid(x: arb) -> arb:
+    return 1 / (1 + (-x).exp())
+
+
+def _silu_first(x: arb) -> arb:
+    s = _sigmoid(x)
+    return s * (1 + x * (1 - s))
+
+
+def _silu_second(x: arb) -> arb:
+    s = _sigmoid(x)
+    return s * (1 - s) * (2 + x * (1 - 2 * s))
+
+
+def _tan_second(x: arb) -> arb:
+    return 2 * x.tan() * x.sec() ** 2
+
+
+FUNCTIONS: dict[str, Function] = {
+    "sin": _smooth(arb.sin, arb.cos, lambda x: -x.sin()),
+    "cos": _smooth(arb.cos, lambda x: -x.sin(), lambda x: -x.cos()),
+    "tan": _smooth(arb.tan, lambda x: x.sec() ** 2, _tan_second),
+    "atan": _smooth(arb.atan, lambda x: 1 / (1 + x * x), lambda x: -2 * x / (1 + x * x) ** 2),
+    "tanh": _smooth(arb.tanh, lambda x: x.sech() ** 2, lambda x: -2 * x.tanh() * x.sech() ** 2),
+    "sigmoid": _smooth(
+        _sigmoid,
+        lambda x: _sigmoid(x) * _sigmoid(-x),
+        lambda x: _sigmoid(x) * _sigmoid(-x) * (_sigmoid(-x) - _sigmoid(x)),
+    ),
+    "silu": _smooth(lambda x: x * _sigmoid(x), _silu_first, _silu_second),
+    "exp": _smooth(arb.exp, arb.exp, arb.exp),
+    "log": _smooth(arb.log, lambda x: 1 / x, lambda x: -1 / x**2),
+    "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt())),
+    "reciprocal": _smooth(lambda x: 1 / x, lambda x: -1 / x**2, lambda x: 2 / x**3),
+    "abs": Function(((None, _line(-1.0), 0.0), (0.0, _line(1.0), None))),
+    "relu": Function(((None, _line(0.0), 0.0), (0.0, _line(1.0), None))),
+}
+"""Functions without parameters, by the name under which a certificate records them."""
+
+
+def leaky_relu(negative_slope: float) -> Function:
+    """``max(x, s x)`` for s <= 1, and torch's definition for any s."""
+    return Function(((None, _line(negative_slope), 0.0), (0.0, _line(1.0), None)))
+
+
+def integer_power(exponent: int) -> Function:
+    """``x^p``."""
+    p = exponent
+    return _smooth(lambda x: x**p, lambda x: p * x ** (p - 1), lambda x: p * (p - 1) * x ** (p - 2))
+
+
+def clamp(low: float | None, high: float | None) -> Function:
+    """``min(max(x, low), high)``; None is no limit."""
+    if low is not None and high is not None and low > high:
+        raise Unproved("clamp with its limits the wrong way round")
+    pieces: list[Piece] = [(low, _line(1.0), high)]
+    if low is not None:
+        pieces.append((None, _line(0.0, low), low))
+    if high is not None:
+        pieces.append((high, _line(0.0, high), None))
+    return Function(tuple(pieces))

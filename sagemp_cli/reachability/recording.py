@@ -1,0 +1,99 @@
+"""What a certificate keeps of a proof: every relaxation that was used, and which generators were kept.
+
+A checker that is given these, the loop and the sets can redo the proof without trusting how they were chosen: a
+bad choice only makes its tube wider, or its check of the recorded radius fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.relaxations.band import Band
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The relaxations of every step, side by side; a loop evaluates the same operations at every step.
+
+    Attributes:
+        operations: names in the order of evaluation.
+        widths: entries of each operation; together E.
+        slope, offset, radius: the bands, ``(*batch, K, E)``; of a product the slope is the power-of-two scale.
+        kept: ``(*batch, K, bytes)``, bit j of row k (least significant first) says whether column j of the
+            generators was kept at the end of step k; None if nothing was dropped.
+    """
+
+    operations: tuple[str, ...]
+    widths: tuple[int, ...]
+    slope: Tensor
+    offset: Tensor
+    radius: Tensor
+    kept: Tensor | None = None
+
+    @staticmethod
+    def of(bands: Sequence[Sequence[tuple[str, Band]]], batch: torch.Size, kept: Sequence[Tensor]) -> Recording:
+        """From a run's bands per step and, where generators were reduced, its masks ``(*batch, columns)`` per step."""
+
+        def stacked(part: int) -> Tensor:
+            def entries(step: Sequence[tuple[str, Band]]) -> Tensor:
+                return torch.cat([band[part].expand(batch + _own(band, batch)).flatten(len(batch)) for _, band in step], -1)
+
+            return torch.stack([entries(step) if step else torch.zeros(*batch, 0) for step in bands], dim=-2).double()
+
+        first = bands[0]
+        return Recording(
+            operations=tuple(name for name, _ in first),
+            widths=tuple(_own(band, batch).numel() for _, band in first),
+            slope=stacked(0),
+            offset=stacked(1),
+            radius=stacked(2),
+            kept=_packed(kept) if len(kept) else None,
+        )
+
+    def select(self, index: Tensor) -> Recording:
+        """The same for some of the first batch dimension."""
+        return self._map(lambda t: t[index])
+
+    def unflatten(self, sizes: tuple[int, ...]) -> Recording:
+        """The first batch dimension split into several."""
+        return self._map(lambda t: t.unflatten(0, sizes))
+
+    def flatten(self) -> Recording:
+        """The first two batch dimensions as one."""
+        return self._map(lambda t: t.flatten(0, 1))
+
+    @staticmethod
+    def join(parts: Sequence[Recording | None]) -> Recording | None:
+        """Recordings of the same loop, one after the other; None if one of them is missing or differs in structure."""
+        known = [p for p in parts if p is not None]
+        if len(known) < len(parts) or len({(p.operations, p.widths, p.kept is None) for p in known}) != 1:
+            return None
+        return Recording(
+            known[0].operations,
+            known[0].widths,
+            *(torch.cat([getattr(p, name) for p in known]) for name in ("slope", "offset", "radius")),
+            kept=None if known[0].kept is None else torch.cat([p.kept for p in known if p.kept is not None]),
+        )
+
+    def _map(self, change) -> Recording:
+        kept = None if self.kept is None else change(self.kept)
+        return Recording(
+            self.operations, self.widths, change(self.slope), change(self.offset), change(self.radius), kept
+        )
+
+
+def _own(band: Band, batch: torch.Size) -> torch.Size:
+    """The event shape of a band."""
+    return torch.broadcast_shapes(*(part.shape for part in band))[len(batch) :]
+
+
+def _packed(masks: Sequence[Tensor]) -> Tensor:
+    """Masks of several lengths as rows of bits, least significant first, padded with zeros."""
+    size = -(-max(m.shape[-1] for m in masks) // 8)
+    rows = torch.stack([torch.nn.functional.pad(m, (0, 8 * size - m.shape[-1])) for m in masks], dim=-2)
+    weights = 2 ** torch.arange(8, dtype=torch.int64)
+    return (rows.unflatten(-1, (size, 8)).long() * weights).sum(-1).to(torch.uint8)

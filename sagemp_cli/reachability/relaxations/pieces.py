@@ -1,0 +1,254 @@
+"""Bands and lines of smooth functions that are convex or concave piece by piece.
+
+For a slope ``a`` let ``e(x) = f(x) - a x``. Where f is convex, e is largest at the ends of the piece, and for *any* point t
+of it ``e(x) >= e(t) + (f'(t) - a)(x - t)``. So a lower bound needs no certified root: t is where ``f'(t) = a`` as well as the
+machine knows, and what is left of ``f'(t) - a`` is paid for. Concave pieces are the same upside down. Every slope gives a
+sound band; which one is used decides only how tight it is.
+
+The best slope. The band's radius is a convex function of the slope, and so is the area under the upper line or over the
+lower one (each is a maximum of functions linear in the slope). On a single piece the chord is best for the band; where an
+interval holds an inflection the minimum is found by cutting planes: each evaluation adds the line that its extreme points
+define, and the next slope is where the last lines on either side meet (a Remez exchange).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.relaxations import lines as _lines
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.lines import Lines
+
+_GOOD = 2e-4  # a slope whose objective is this close to the best, in units of the excess's range, is not refined
+
+Objective = Callable[["Excess", Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Value and derivative, with respect to the slope, of what a slope is chosen for; from the excess, the slope and the middle."""
+
+
+class Piece(NamedTuple):
+    """Where a function is convex (or concave).
+
+    Attributes:
+        start, end: of the piece, numbers or tensors. Where they are inflections they may be off by rounding: the curvature
+            there is of that order too, and its effect of second order.
+        convex: or concave.
+        touch: the point whose derivative is a given slope, as well as it can be had; arguments slope and the ends of that part of
+            the piece which lies in the interval. Any number is sound, NaN means the start.
+    """
+
+    start: float | Tensor
+    end: float | Tensor
+    convex: bool
+    touch: Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A differentiable function made of convex and concave pieces in alternation.
+
+    Attributes:
+        value: ``f``, as computed.
+        derivative: ``f'``, as computed.
+        pieces: from left to right; together they cover the domain.
+        ulps: both are computed to within ``ulps * 2^-52`` of their size.
+        floor: error of the value that is not relative to its size.
+        derivative_floor: the same for the derivative.
+    """
+
+    value: Callable[[Tensor], Tensor]
+    derivative: Callable[[Tensor], Tensor]
+    pieces: tuple[Piece, ...]
+    ulps: float
+    floor: float = TINY
+    derivative_floor: float = 0.0
+
+    @property
+    def margin(self) -> float:
+        """Relative error of ``f(x) - a x`` as computed: of f, of the product and of the difference."""
+        return (2 * self.ulps + 4) * UNIT
+
+
+class Excess(NamedTuple):
+    """Bounds of ``f(x) - a x`` over an interval, rounding included, and the points where they are (nearly) attained."""
+
+    least: Tensor
+    most: Tensor
+    lowest: Tensor
+    highest: Tensor
+
+
+def band(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None = None) -> Band:
+    """The band of smallest radius.
+
+    Args:
+        curve: the function.
+        lower, upper: ends of the intervals.
+        allowed: intervals inside the function's domain; elsewhere the band claims nothing.
+    """
+    lower, upper, outside = _confined(lower, upper, allowed)
+    slope = _chord(curve, lower, upper)
+    crossing = _crossing(curve, lower, upper)
+    if bool(crossing.any()):
+        slope = torch.where(crossing, _refined(curve, lower, upper, radius_objective), slope)
+    found = excess(curve, slope, lower, upper)
+    radius = 0.5 * (found.most - found.least) + (found.most.abs() + found.least.abs()) * (2 * UNIT) + outside
+    return settled(slope, 0.5 * (found.most + found.least), radius)
+
+
+def lines(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None = None) -> Lines:
+    """The lines of smallest area: on one piece the chord and the tangent at the middle; see the module for the others."""
+    lower, upper, outside = _confined(lower, upper, allowed)
+    middle = 0.5 * lower + 0.5 * upper
+    slopes = [_chord(curve, lower, upper), curve.derivative(middle)]
+    if bool(_crossing(curve, lower, upper).any()):
+        slopes += [_refined(curve, lower, upper, objective) for objective in (upper_objective, lower_objective)]
+    best = None
+    for slope in slopes:
+        found = excess(curve, slope, lower, upper)
+        pair = Lines(slope, found.least, slope, found.most)
+        best = pair if best is None else _lines.choose(best, pair, middle)
+    return _lines.settled(best._replace(upper_offset=best.upper_offset + outside))
+
+
+def excess(curve: Curve, slope: Tensor, lower: Tensor, upper: Tensor) -> Excess:
+    """Sound bounds of ``f(x) - slope x`` on ``[lower, upper]``, for any slope."""
+
+    def at(x: Tensor) -> tuple[Tensor, Tensor]:
+        value, line = curve.value(x), slope * x
+        return value - line, (value.abs() + line.abs()) * curve.margin + curve.floor
+
+    (first, first_error), (last, last_error) = at(lower), at(upper)
+    low_first, low_last = first - first_error, last - last_error
+    high_first, high_last = first + first_error, last + last_error
+    found = Excess(
+        torch.minimum(low_first, low_last),
+        torch.maximum(high_first, high_last),
+        torch.where(low_first <= low_last, lower, upper),
+        torch.where(high_first >= high_last, lower, upper),
+    )
+    for piece in curve.pieces:
+        start, end = _part(piece.start, lower, upper), _part(piece.end, lower, upper)
+        if not bool((start < end).any()):
+            continue
+        t = torch.minimum(torch.fmax(piece.touch(slope, start, end), start), end)
+        value, error = at(t)
+        derivative = curve.derivative(t)
+        tilt = derivative - slope
+        left, right = (t - start) * tilt, (t - end) * tilt
+        error = error + (end - start) * ((derivative.abs() + slope.abs() + curve.derivative_floor) * curve.margin)
+        if piece.convex:
+            candidate = value - error - torch.maximum(left, right)
+            found = found._replace(
+                lowest=torch.where(candidate < found.least, t, found.lowest), least=torch.minimum(candidate, found.least)
+            )
+        else:
+            candidate = value + error - torch.minimum(left, right)
+            found = found._replace(
+                highest=torch.where(candidate > found.most, t, found.highest), most=torch.maximum(candidate, found.most)
+            )
+    return found
+
+
+def best_slope(
+    evaluate: Callable[[Tensor], Excess],
+    lower: Tensor,
+    upper: Tensor,
+    *,
+    values: tuple[Tensor, Tensor],
+    objective: Objective,
+    steepest: float = math.inf,
+    iterations: int = 8,
+) -> Tensor:
+    """The slope that makes a convex objective smallest, by cutting planes; the first one tried is the chord's.
+
+    Args:
+        evaluate: the excess at a slope.
+        lower, upper: ends of the intervals.
+        values: the function at the ends.
+        objective: what to minimise.
+        steepest: bound of ``|slope|``.
+        iterations: most evaluations.
+    """
+    middle = 0.5 * lower + 0.5 * upper
+    zero = torch.zeros_like(lower)
+    # The two planes that the ends alone define: one falls, the other rises with the slope.
+    left, left_grade = objective(Excess(*values, lower, upper), zero, middle)
+    right, right_grade = objective(Excess(values[1], values[0], upper, lower), zero, middle)
+    best, lowest = zero, torch.full_like(lower, math.inf)
+    for _ in range(iterations):
+        rise = right_grade - left_grade
+        slope = torch.where(rise > 0, (left - right) / rise, best).clamp(-steepest, steepest)
+        found = evaluate(slope)
+        now, grade = objective(found, slope, middle)
+        plane, falls, better = now - grade * slope, grade <= 0, now < lowest
+        best, lowest = torch.where(better, slope, best), torch.where(better, now, lowest)
+        # The planes bound the objective from below, so they say how far from the best this slope can be.
+        if bool((now - left - left_grade * slope <= _GOOD * (found.most - found.least)).all()):
+            break
+        left, left_grade = torch.where(falls, plane, left), torch.where(falls, grade, left_grade)
+        right, right_grade = torch.where(falls, right, plane), torch.where(falls, right_grade, grade)
+    return best
+
+
+@torch.no_grad()
+def _refined(curve: Curve, lower: Tensor, upper: Tensor, objective: Objective) -> Tensor:
+    return best_slope(
+        lambda slope: excess(curve, slope, lower, upper),
+        lower,
+        upper,
+        values=(curve.value(lower), curve.value(upper)),
+        objective=objective,
+    )
+
+
+def radius_objective(found: Excess, slope: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Radius of the band with this slope."""
+    return 0.5 * (found.most - found.least), 0.5 * (found.lowest - found.highest)
+
+
+def upper_objective(found: Excess, slope: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Height of the upper line at the middle, which orders the areas under it."""
+    return found.most + slope * middle, middle - found.highest
+
+
+def lower_objective(found: Excess, slope: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth of the lower line at the middle."""
+    return -found.least - slope * middle, found.lowest - middle
+
+
+def _part(boundary: float | Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """A piece's boundary, moved into the interval."""
+    return torch.minimum(lower.clamp(min=boundary), upper)
+
+
+def _crossing(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor:
+    """Whether an inflection lies inside."""
+    crossing = torch.zeros_like(lower, dtype=torch.bool)
+    for piece in curve.pieces[1:]:
+        crossing = crossing | ((lower < piece.start) & (piece.start < upper))
+    return crossing
+
+
+def _chord(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor:
+    """Slope of the chord, or where that would be rounding only, of the tangent at the middle."""
+    width = upper - lower
+    wide = width > 1e-6 * (lower.abs() + upper.abs()) + TINY
+    chord = (curve.value(upper) - curve.value(lower)) / torch.where(wide, width, torch.ones_like(width))
+    return torch.where(wide, chord, curve.derivative(0.5 * lower + 0.5 * upper))
+
+
+def _confined(lower: Tensor, upper: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor, Tensor | float]:
+    """Intervals to compute with, 1 where nothing can be said, and what to add to the radius: infinity there."""
+    good = torch.isfinite(lower) & torch.isfinite(upper)
+    if allowed is not None:
+        good = good & allowed
+    if bool(good.all()):
+        return lower, upper, 0.0
+    one, zero = torch.ones_like(lower), torch.zeros_like(lower)
+    return torch.where(good, lower, one), torch.where(good, upper, one), torch.where(good, zero, zero + math.inf)

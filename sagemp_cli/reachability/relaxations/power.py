@@ -1,0 +1,78 @@
+"""Integer powers ``x^n``, square and reciprocal among them.
+
+Even powers are convex (negative ones on either side of the pole); odd ones are concave left of 0 and convex right of it.
+An interval that holds the pole of a negative power has no band.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.relaxations import pieces
+from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
+from sagemp_cli.reachability.relaxations.value_range import outward
+
+ULPS = 4
+"""Margin allowed to ``torch.pow`` with an integer exponent and to its derivative, in ulps of the result; tested against ball arithmetic."""
+
+
+def band(lower: Tensor, upper: Tensor, exponent: int) -> Band:
+    """Band of ``x^exponent`` on ``[lower, upper]``; the exponent is neither 0 nor 1."""
+    return pieces.band(_curve(exponent), lower, upper, allowed=_allowed(lower, upper, exponent))
+
+
+def lines(lower: Tensor, upper: Tensor, exponent: int) -> Lines:
+    """Lines of ``x^exponent`` on ``[lower, upper]``; the exponent is neither 0 nor 1."""
+    return pieces.lines(_curve(exponent), lower, upper, allowed=_allowed(lower, upper, exponent))
+
+
+def value_range(lower: Tensor, upper: Tensor, exponent: int) -> tuple[Tensor, Tensor]:
+    """Bounds of ``x^exponent`` on ``[lower, upper]``, infinite if there is a pole."""
+    first, last = torch.pow(lower, exponent), torch.pow(upper, exponent)
+    least, most = torch.minimum(first, last), torch.maximum(first, last)
+    within = (lower <= 0) & (upper >= 0)
+    if exponent < 0:
+        least = torch.where(within, torch.full_like(least, math.nan), least)
+        most = torch.where(within, torch.full_like(most, math.nan), most)
+    elif exponent % 2 == 0:
+        least = torch.where(within, torch.zeros_like(least), least)
+    return outward(least, most, ulps=ULPS)
+
+
+def _allowed(lower: Tensor, upper: Tensor, exponent: int) -> Tensor | None:
+    return (lower > 0) | (upper < 0) if exponent < 0 else None
+
+
+@functools.cache
+def _curve(exponent: int) -> Curve:
+    n = exponent
+
+    def value(x: Tensor) -> Tensor:
+        return torch.pow(x, n)
+
+    def derivative(x: Tensor) -> Tensor:
+        return n * torch.pow(x, n - 1)
+
+    def size(slope: Tensor) -> Tensor:
+        """``|x|`` where the derivative is the slope, or minus it."""
+        return torch.pow((slope / n).abs(), 1.0 / (n - 1))
+
+    def right(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        return size(slope)
+
+    def left(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        return -size(slope)
+
+    def either(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        """Even powers: the derivative has the sign of x if n > 0, the other one if n < 0."""
+        return torch.copysign(size(slope), slope if n > 0 else -slope)
+
+    if n % 2 == 0:
+        return Curve(value, derivative, (Piece(-math.inf, math.inf, True, either),), ULPS)
+    return Curve(value, derivative, (Piece(-math.inf, 0.0, False, left), Piece(0.0, math.inf, True, right)), ULPS)

@@ -1,0 +1,25 @@
+"""Sound bounds of a function's values, rounded outwards: what the interval propagator uses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT
+
+
+def outward(least: Tensor, most: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:
+    """Computed extreme values, moved outwards by their relative error (``ulps`` of 2^-52) and underflow; NaN becomes infinite."""
+    margin = (2 * ulps + 1) * UNIT
+    return (
+        torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf),
+        torch.nan_to_num(most + (most.abs() * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf),
+    )
+
+
+def increasing(value: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:
+    """Range of an increasing function."""
+    return outward(value(lower), value(upper), ulps=ulps)

@@ -1,0 +1,62 @@
+"""The command line with stages that are made up: they write example records at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sagemp_cli.cli.main import app
+from sagemp_cli.stages.stage import STAGES
+
+
+@pytest.fixture
+def sagemp(tmp_path, monkeypatch):
+    """``sagemp("verify", "--partitions", "4")`` in an empty folder: ``exit_code``, ``stdout``, ``stderr``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SAGEMP_DEBUG", raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+    runner = CliRunner()
+
+    def call(*arguments):
+        return runner.invoke(app, [str(a) for a in arguments], prog_name="sagemp")
+
+    return call
+
+
+@pytest.fixture
+def made_up(monkeypatch, example):
+    """Replace what every stage computes; ``ran`` lists the stages that ran, ``certificate`` is what verify writes."""
+    state = SimpleNamespace(ran=[], certificate={"verdict": "VERIFIED"}, seed=0)
+
+    def fake(stage):
+        def run(context):
+            parents = tuple(context.read(name) for name in stage.inputs)
+            state.ran.append(stage.name)
+            state.seed += 1  # every run writes another file
+            record = example(stage.record, seed=state.seed, count=1, cells=4)
+            if stage.name == "verify":
+                safe = state.certificate["verdict"] == "VERIFIED"
+                tubes = dataclasses.replace(
+                    record.tubes,
+                    verdict=("SAFE" if safe else "MAY_COLLIDE",),
+                    step=np.array([-1 if safe else 17]),
+                    constraint=("" if safe else "lower disc",),
+                    constraint_names=("workspace", "lower disc"),
+                    clearance=np.array([[1.5, 0.25]]),
+                )
+                record = dataclasses.replace(record, tubes=tubes, **state.certificate)
+            path = context.write(stage.name, record, parents)
+            path.with_suffix(".png").write_bytes(b"a figure")
+            return path
+
+        return run
+
+    for stage in STAGES:
+        module = importlib.import_module(f"sagemp_cli.stages.{stage.name.replace('-', '_')}")
+        monkeypatch.setattr(module, "run", fake(stage))
+    return state

@@ -1,0 +1,87 @@
+"""--help: quick, with examples, for every command; and what typing errors get."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+COMMANDS = [
+    ["gen-data"],
+    ["train-planner"],
+    ["train-tracker"],
+    ["verify"],
+    ["build-library"],
+    ["execute"],
+    ["run"],
+    ["status"],
+    ["inspect"],
+    ["doctor"],
+    ["config", "show"],
+    ["config", "validate"],
+    ["config", "list"],
+]
+HEAVY = ("torch", "scipy", "matplotlib", "hydra", "h5py", "numpy", "yaml")
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_every_command_has_help_with_examples_of_itself(sagemp, command):
+    result = sagemp(*command, "--help")
+    assert result.exit_code == 0
+    assert "Examples" in result.stdout
+    assert f"$ sagemp {' '.join(command)}" in result.stdout
+
+
+def test_the_help_lists_every_command(sagemp):
+    listed = sagemp("--help").stdout
+    for command in COMMANDS:
+        assert f"│ {command[0]} " in listed
+
+
+def test_examples_in_the_help_show_brackets_as_typed(sagemp):
+    assert "'tracker.hidden=[8,8]'" in sagemp("train-tracker", "--help").stdout
+
+
+def test_help_imports_nothing_heavy_and_comes_at_once():
+    script = (
+        "import sys\n"
+        "sys.argv = ['sagemp', 'verify', '--help']\n"
+        "from sagemp_cli.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"print([m for m in {HEAVY!r} if m in sys.modules], file=sys.stderr)"
+    )
+    best = float("inf")
+    for _ in range(3):
+        began = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        best = min(best, time.perf_counter() - began)
+        assert done.stderr.strip() == "[]"
+    assert best < 1.0
+
+
+def test_the_version_is_shown(sagemp):
+    from sagemp_cli import __version__
+
+    assert sagemp("--version").stdout == f"sagemp {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["verfy"], "Did you mean 'verify'?"),
+        (["verify", "--partition", "4"], "--partitions"),
+        (["run", "--untill", "verify"], "--until"),
+        (["inspect"], "Missing argument"),
+        (["verify", "--seed", "x"], "--seed"),
+    ],
+)
+def test_an_unknown_command_or_option_gets_the_nearest_known_one_and_exit_code_2(sagemp, arguments, message):
+    result = sagemp(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_shell_completion_is_offered(sagemp):
+    assert "--install-completion" in sagemp("--help").stdout

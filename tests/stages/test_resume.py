@@ -1,0 +1,105 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sagemp_cli.errors import ArtifactError, ResourceError
+from sagemp_cli.stages.partial import PartialResults
+from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.storage import Demonstrations, PlannerModel, TrackerModel, read_artifact
+
+from .conftest import Interrupt
+
+_MEASURED = ("seconds",)
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if field.name in _MEASURED:
+            continue
+        if dataclasses.is_dataclass(left):
+            assert_same(left, right)
+        elif isinstance(left, dict):
+            assert left.keys() == right.keys()
+            for key in left:
+                np.testing.assert_array_equal(left[key], right[key])
+        else:
+            np.testing.assert_array_equal(left, right)
+
+
+def test_gen_data_goes_on_where_it_was_interrupted(work, toy_folder):
+    stage = stage_named("gen-data")
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(work(progress=Interrupt(after=5)))
+    context = work(progress=Interrupt())
+    assert not context.output_path("gen-data").exists()
+    kept = PartialResults.of(context, "gen-data", without=("expert.count", "expert.processes")).finished
+    assert kept == {0, 1, 2, 3, 4}
+    again = read_artifact(stage.run(context), Demonstrations).record
+    assert context.progress.resumed == {"demonstrations": 5}
+    assert context.progress.advanced == 7
+    assert_same(again, read_artifact(toy_folder / "demonstrations.h5", Demonstrations).record)
+    assert not context.partial_folder("gen-data").exists()
+
+
+def test_more_demonstrations_keep_the_finished_ones_and_another_expert_does_not(work):
+    stage = stage_named("gen-data")
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(work(progress=Interrupt(after=3)))
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(work(progress=(more := Interrupt(after=1)), overrides=("expert.count=40",)))
+    assert more.resumed == {"demonstrations": 3}
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(work(progress=(other := Interrupt(after=1)), overrides=("expert.margin=0.31",)))
+    assert other.resumed == {"demonstrations": 0}
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(work(progress=(back := Interrupt(after=1))))
+    assert back.resumed == {"demonstrations": 0}
+
+
+@pytest.mark.parametrize(
+    ("name", "record", "needs", "overrides"),
+    [
+        ("train-planner", PlannerModel, ("gen-data",), ("planner_training.steps=120",)),
+        ("train-tracker", TrackerModel, ("gen-data", "train-planner"), ("training.steps=25",)),
+    ],
+)
+def test_training_goes_on_where_it_was_interrupted_and_ends_in_the_same_bits(work, name, record, needs, overrides):
+    stage = stage_named(name)
+    whole = read_artifact(stage.run(work(*needs, overrides=overrides)), record).record
+    interrupted = work(*needs, overrides=overrides, overwrite=True, progress=Interrupt(after=5))
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(interrupted)
+    assert len(list(interrupted.partial_folder(name).rglob("*.h5"))) == 1
+    context = work(*needs, overrides=overrides, overwrite=True, progress=Interrupt())
+    resumed = read_artifact(stage.run(context), record).record
+    assert max(context.progress.resumed.values()) >= 5
+    assert_same(resumed, whole)
+    assert not context.partial_folder(name).exists()
+
+
+def test_a_damaged_piece_is_deleted_and_made_again(work):
+    context = work()
+    partial = PartialResults.of(context, "gen-data")
+    partial.save(3, {"a": np.arange(4)})
+    np.testing.assert_array_equal(partial.load(3)["a"], np.arange(4))
+    (partial.folder / "000003.npz").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(ResourceError, match="000003.npz: damaged piece, deleted; run the stage again"):
+        partial.load(3)
+    assert partial.finished == set()
+
+
+def test_pieces_never_hold_pickles(work):
+    partial = PartialResults.of(work(), "gen-data")
+    np.savez(partial.folder / "000001.npz", a=np.array([{"any": "object"}], dtype=object))
+    with pytest.raises(ResourceError, match="damaged piece"):
+        partial.load(1)
+
+
+def test_a_changed_parent_is_refused(work):
+    context = work("gen-data", "train-planner")
+    demonstrations = context.output_path("gen-data")
+    demonstrations.write_bytes(demonstrations.read_bytes() + b"\0")
+    with pytest.raises(ArtifactError, match="was made from an earlier .*demonstrations.h5, which has changed since"):
+        stage_named("train-tracker").run(context)
