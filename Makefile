@@ -47,8 +47,8 @@ reproduce-figures: venv  ## make every artifact and figure at full effort
 	@for experiment in $$($(BIN)/python -c 'from sagemp_cli.config import options_of; print(*options_of("experiment"))'); do \
 		$(BIN)/sagemp run experiment=$$experiment; code=$$?; \
 		case $$code in 0|5|10) ;; *) exit $$code;; esac; \
-		ls artifacts/$$experiment/*.png; \
 	done
+	$(BIN)/python -m sagemp_cli.report.reproduce
 
 benchmark: venv  ## run the benchmarks
 	@for file in benchmarks/*.py; do \

@@ -7,6 +7,7 @@ until its curvature has one sign, where a tangent and a chord bound it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -77,6 +78,8 @@ class Smooth:
                 break
             step = ((self.first(x) - slope) / bend).mid()
             x = (x - step).max(low).min(high).mid()
+            if abs(step) * ball(2.0**40) <= high - low:
+                break
         at, tilt = self.value(x) - slope * x, self.first(x) - slope
         return pick(at + tilt * (low - x), at + tilt * (high - x))
 
@@ -168,6 +171,27 @@ FUNCTIONS: dict[str, Function] = {
 def leaky_relu(negative_slope: float) -> Function:
     """``max(x, s x)`` for s <= 1, and torch's definition for any s."""
     return Function(((None, _line(negative_slope), 0.0), (0.0, _line(1.0), None)))
+
+
+def elu(alpha: float) -> Function:
+    """``x`` above 0, ``a (exp x - 1)`` below."""
+    a = ball(alpha)
+    below = Smooth(lambda x: a * x.expm1(), lambda x: a * x.exp(), lambda x: a * x.exp())
+    return Function(((None, below, 0.0), (0.0, _line(1.0), None)))
+
+
+def softplus(beta: float, threshold: float) -> Function:
+    """``log(1 + exp(b x)) / b``, or x where ``b x`` exceeds the threshold (both are allowed there)."""
+    if not beta > 0:
+        raise Unproved(f"softplus needs a positive beta, found {beta}")
+    b = ball(beta)
+    smooth = Smooth(
+        lambda x: (b * x).exp().log1p() / b,
+        lambda x: _sigmoid(b * x),
+        lambda x: b * _sigmoid(b * x) * _sigmoid(-b * x),
+    )
+    begin = math.nextafter(threshold / beta, -math.inf)
+    return Function(((None, smooth, None), (begin, _line(1.0), None)))
 
 
 def integer_power(exponent: int) -> Function:

@@ -1,21 +1,27 @@
 """The set of states at one step, ``center + G [-1, 1]^M``, and what can be read off it.
 
-The centre is exact. The generators, thousands of columns, are exact float64 numbers; whatever a product with them
-loses goes into the result as a bound (a midpoint-radius matrix, Rump 1999). Used of float64: every sum and product
-is correctly rounded, in whatever order a sum of products is taken, so that a sum of n products errs by at most
-``n u / (1 - n u)`` times the sum of their absolute values (Higham 2002, section 3.1), u = 2^-53, plus underflow.
+The centre is exact. The generators, thousands of columns, are exact float64 numbers; what is lost in a product with
+them is bounded beforehand and kept (a midpoint-radius matrix, Rump 1999). Used of float64: sums and products are
+correctly rounded, in whatever order a sum of products is taken, so that a sum of n products errs by at most
+``n u / (1 - n u)`` times the sum of their absolute values (Higham 2002, section 3.1), ``u = 2^-53``, plus underflow;
+and of python-flint: ``float`` of a ball is within one unit in the last place of its midpoint.
+
+Rows. A value that depends on the states and on q further variables in [-1, 1] is a row ``[c, a_1..a_n, b_1..b_q]`` of
+balls: ``c + a (x - center) + b [-1, 1]^q``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from sagemp_cli.checker.balls import Unproved, arb, ball, balls, nearest, upper_float
+from sagemp_cli.checker.balls import Unproved, arb, arb_mat, balls, upper_float
 
 _EPS = 2.0**-52  # twice the unit roundoff: absorbs the 1 / (1 - n u)
+_UP = 1.0 + 2.0**-20  # more than what rounding does to a bound of a loss while it is computed
 _UNDERFLOW = 2.0**-900
+_SMALLEST = 2.0**-1070  # an entry of a row that underflows, times what it multiplies
 
 
 class Zonotope:
@@ -23,20 +29,20 @@ class Zonotope:
 
     Attributes:
         center: n balls, exact.
-        generators: ``(n, M)`` float64.
-        reach: upper bounds of ``sum_j |G_ij|``, n balls.
+        generators: ``(n, M)``.
+        reach: upper bounds of ``sum_j |G_ij|``, ``(n,)``.
     """
 
     def __init__(self, center: Sequence[arb], generators: np.ndarray) -> None:
-        if generators.size and not np.isfinite(generators).all():
-            raise Unproved("a bound overflowed")
         self.center = [c.mid() for c in center]
         self.generators = generators
-        self.reach = [self._total(row) for row in generators]
+        self.reach = _sums(generators)
+        if not np.isfinite(self.reach).all():
+            raise Unproved("a bound overflowed")
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float]) -> Zonotope:
-        """The smallest one around a box."""
+        """One that contains a box: the box itself up to rounding of its radii."""
         low, high = balls(lower), balls(upper)
         center = [((a + b) / 2).mid() for a, b in zip(low, high, strict=True)]
         radius = [upper_float((b - c).max(c - a)) if a != b else 0.0 for a, b, c in zip(low, high, center, strict=True)]
@@ -44,50 +50,47 @@ class Zonotope:
 
     def bounds(self) -> list[tuple[arb, arb]]:
         """Lower and upper bound of each state."""
-        return [(c - r, c + r) for c, r in zip(self.center, self.reach, strict=True)]
+        return [(c - r, c + r) for c, r in zip(self.center, map(arb, self.reach.tolist()), strict=True)]
 
-    def radii(self, rows: Sequence[Mapping[int, arb]]) -> list[arb]:
-        """Upper bounds of ``|row . (x - center)|`` over the set, for rows given by their nonzero coefficients."""
+    def radii(self, rows: arb_mat) -> list[arb]:
+        """Upper bounds of how far the values of rows may be from their ``c``."""
         matrix, lost = self._rounded(rows)
-        sums = np.abs(matrix @ self.generators)
-        return [self._total(s) + loss for s, loss in zip(sums, lost, strict=True)]
+        n = len(self.center)
+        total = _sums(matrix[:, 1 : n + 1] @ self.generators) + _sums(matrix[:, n + 1 :])
+        return [arb(r) for r in (total * (1 + 4 * _EPS) + lost).tolist()]
 
-    def image(self, center: Sequence[arb], rows: Sequence[Mapping[int, arb]], fresh: Sequence[Sequence[arb]]) -> Zonotope:
-        """The set of ``center + rows (x - old center) + fresh [-1, 1]^l``.
-
-        Its columns: the old ones mapped, the l fresh ones, and one for each state with everything that was rounded.
+    def image(self, rows: arb_mat) -> Zonotope:
+        """The set of n values. Its columns: the old ones mapped, one for each further variable, and one for each
+        state with all that was rounded.
         """
         matrix, lost = self._rounded(rows)
-        own = np.zeros((len(rows), len(fresh[0])))
-        for i, entries in enumerate(fresh):
-            lost[i] += center[i].rad()
-            for j, entry in enumerate(entries):
-                own[i, j], distance = nearest(entry)
-                lost[i] += distance
-        errors = np.diag([upper_float(e) for e in lost])
-        return Zonotope(center, np.hstack([matrix @ self.generators, own, errors]))
+        n = len(self.center)
+        center = [rows[i, 0] for i in range(n)]
+        errors = [upper_float(arb(e) + c.rad()) for e, c in zip(lost.tolist(), center, strict=True)]
+        return Zonotope(
+            center, np.hstack([matrix[:, 1 : n + 1] @ self.generators, matrix[:, n + 1 :], np.diag(errors)])
+        )
 
     def reduced(self, kept: np.ndarray) -> Zonotope:
         """The columns of a mask, and a box around the sum of the others."""
-        others = self.generators[:, ~kept]
-        radius = [upper_float(self._total(row)) for row in others]
-        return Zonotope(self.center, np.hstack([self.generators[:, kept], np.diag(radius)]))
+        if kept.all():
+            return self
+        others = np.diag(_sums(self.generators[:, ~kept]))
+        return Zonotope(self.center, np.hstack([self.generators[:, kept], others]))
 
-    def _rounded(self, rows: Sequence[Mapping[int, arb]]) -> tuple[np.ndarray, list[arb]]:
-        """Rows as float64, and per row what the rounding of the rows and of their product with G loses."""
-        n = len(self.center)
-        matrix, lost = np.zeros((len(rows), n)), []
-        for i, row in enumerate(rows):
-            loss = ball(_UNDERFLOW)
-            for j, coefficient in row.items():
-                matrix[i, j], distance = nearest(coefficient)
-                loss += (distance + ball(abs(matrix[i, j])) * ball((n + 2) * _EPS)) * self.reach[j]
-            lost.append(loss)
+    def _rounded(self, rows: arb_mat) -> tuple[np.ndarray, np.ndarray]:
+        """Rows as float64, and per row what rounding them and multiplying them with the generators loses at most."""
+        n, width = len(self.center), rows.ncols()
+        matrix = np.array([float(a) for a in rows.entries()]).reshape(rows.nrows(), width)
+        weights = np.concatenate([[0.0], self.reach, np.ones(width - n - 1)])
+        balls_left = (rows - rows.mid()) * arb_mat(width, 1, weights.tolist())  # entries are balls around 0
+        lost = np.array([float(b.abs_upper()) for b in balls_left.entries()])
+        lost = (lost + np.abs(matrix) @ weights * ((n + 4) * _EPS)) * _UP + (weights.sum() * _SMALLEST + _UNDERFLOW)
+        if not np.isfinite(lost).all():
+            raise Unproved("a bound overflowed")
         return matrix, lost
 
-    @staticmethod
-    def _total(row: np.ndarray) -> arb:
-        """An upper bound of the sum of absolute values of float64 numbers."""
-        if not row.any():
-            return ball(0.0)
-        return (ball(np.abs(row).sum()) * (1 + ball((row.size + 2) * _EPS)) + ball(_UNDERFLOW)).upper()
+
+def _sums(rows: np.ndarray) -> np.ndarray:
+    """Upper bounds of the sums of absolute values of rows of float64 numbers."""
+    return np.abs(rows).sum(axis=1) * (1 + (rows.shape[1] + 4) * _EPS)

@@ -125,6 +125,8 @@ def _print(content: dict[str, Any]) -> None:
     from rich.text import Text
 
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=200)  # nobody resizes a pipe: one line per field
     facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     for key in ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256"):
         value = content[key]

@@ -9,6 +9,7 @@ import typer
 from sagemp_cli import __version__
 from sagemp_cli.cli import (
     build_library,
+    check,
     config,
     doctor,
     execute,
@@ -45,6 +46,7 @@ for _name, _function, _examples, _panel in (
     ("build-library", build_library.build_library, build_library.EXAMPLES, _PIPELINE),
     ("execute", execute.execute, execute.EXAMPLES, _PIPELINE),
     ("run", run.run, run.EXAMPLES, _AROUND),
+    ("check", check.check, check.EXAMPLES, _AROUND),
     ("status", status.status, status.EXAMPLES, _AROUND),
     ("inspect", inspect.inspect, inspect.EXAMPLES, _AROUND),
     ("doctor", doctor.doctor, doctor.EXAMPLES, _AROUND),

@@ -51,18 +51,21 @@ def status(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title=f"{context.config['name']} in {context.folder}", title_justify="left", box=None, padding=(0, 2, 0, 0)
-    )
-    for column in ("stage", "reads", "file", "state", "made (UTC)", "why"):
-        table.add_column(column, overflow="fold")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=200)  # nobody resizes a pipe: one line per file
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("stage", "reads", "file", "state"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("note", overflow="fold")
     for name, state in states.items():
+        made = f"made {state.header.created_utc[:16].replace('T', ' ')} UTC" if state.header else ""
         table.add_row(
             name,
             ", ".join(states[i].stage.role for i in state.stage.inputs) or "-",
             state.path.name,
             Text(str(state.freshness), style=_STYLES[state.freshness]),
-            state.header.created_utc.removesuffix("+00:00") if state.header else "",
-            Text(state.why),
+            Text(state.why or made),
         )
-    Console().print(table)
+    console.print(f"{context.config['name']} in {context.folder}", markup=False, highlight=False)
+    console.print(table)

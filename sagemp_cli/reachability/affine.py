@@ -12,6 +12,7 @@ feedback then contracts. Rounding is included (last block), so the tube encloses
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.reachability.affine_form import AffineForm, StepFrame
+from sagemp_cli.reachability.affine_form import AffineForm, Hints, StepFrame
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.reduction import reduce_generators
@@ -36,11 +37,16 @@ class AffineRun:
         tube: bounds per step, ``(*batch, K+1, n)``.
         bands: per step, the bands used, in the order of evaluation.
         kept: per step, the mask of the generators kept ``(*batch, M)``; empty if none were ever dropped.
+        steps: per step, the form of the next state (and in its frame, what went into it); empty unless asked for.
+        center, generators: the zonotope after the last step.
     """
 
     tube: Tube
     bands: list[list[tuple[str, Band]]] = field(repr=False)
     kept: list[Tensor] = field(default_factory=list, repr=False)
+    steps: list[AffineForm] = field(default_factory=list, repr=False)
+    center: Tensor | None = field(default=None, repr=False)
+    generators: Tensor | None = field(default=None, repr=False)
 
     def recording(self) -> Recording:
         """What a certificate keeps of the run."""
@@ -82,30 +88,57 @@ class Affine:
         bad = torch.isnan(lower) | torch.isnan(upper)
         return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
 
-    def run(self, loop: Loop, start: Box, disturbance: Box, *, horizon: int | None = None) -> AffineRun:
-        """Propagate and keep the bands (differentiable where autograd is on)."""
-        center, radius = start.center, start.radius
-        generators = torch.diag_embed(radius)
-        reach = radius
+    def run(
+        self,
+        loop: Loop,
+        start: Box,
+        disturbance: Box,
+        *,
+        horizon: int | None = None,
+        first: int = 0,
+        before: AffineRun | None = None,
+        keep_steps: bool = False,
+        hints: Sequence[Hints] | None = None,
+    ) -> AffineRun:
+        """Propagate and keep the bands (differentiable where autograd is on).
+
+        Args:
+            loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
+            horizon: the step after the last one; the loop's by default.
+            first: the first step.
+            before: the run that ended there; the start box is only used without one.
+            keep_steps: keep every step's form, for a backward pass.
+            hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
+        """
+        if before is None:
+            center, reach = start.center, start.radius
+            generators = torch.diag_embed(reach)
+            lowers, uppers = [start.lower], [start.upper]
+        else:
+            center, generators = before.center, before.generators
+            reach = _reach(generators)
+            lowers, uppers = [before.tube.lower[..., -1, :]], [before.tube.upper[..., -1, :]]
         w_center, w_radius = disturbance.center, disturbance.radius
-        lowers, uppers, bands, masks = [start.lower], [start.upper], [], []
+        bands, masks, kept_steps = [], [], []
         steps = loop.horizon if horizon is None else horizon
-        for k in range(steps):
-            frame = StepFrame(generators, reach, w_radius)
+        for k in range(first, steps):
+            frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k - first])
             after = loop.step(k, frame.state(center), frame.disturbance(w_center))
             bands.append(frame.bands)
-            center, generators = _advance(after, frame)
+            if keep_steps:
+                kept_steps.append(after)
+            center, generators = _advance(after)
             if self.symbols is not None:
                 generators, mask = reduce_generators(generators, self.symbols)
                 masks.append(mask)
-            growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
-            reach = generators.abs().sum(-1) * growth
+            reach = _reach(generators)
             spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
             lowers.append(center - spread)
             uppers.append(center + spread)
             if not bool(torch.isfinite(reach).all()):
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
-        return AffineRun(Tube(torch.stack(lowers, -2), torch.stack(uppers, -2)), bands, masks)
+        tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
+        return AffineRun(tube, bands, masks, kept_steps, center, generators)
 
 
 @dataclass(frozen=True)
@@ -129,11 +162,14 @@ class _Watched:
         return self.loop.dynamics.step(x, u, w)
 
 
-def _advance(after: AffineForm, frame: StepFrame) -> tuple[Tensor, Tensor]:
+def _advance(after: AffineForm) -> tuple[Tensor, Tensor]:
     """Centre and generators of the next state set from the step's affine form."""
-    rows = after.spread()
-    error = after.magnitude * ((after.error + (2 * frame.states + 16) * UNIT) * (1 + 1e-9))
-    return after.center, torch.cat([rows, torch.diag_embed(error)], dim=-1)
+    return after.center, torch.cat([after.spread(), torch.diag_embed(after.rounding())], dim=-1)
+
+
+def _reach(generators: Tensor) -> Tensor:
+    """Radius of the zonotope's box, rounded up."""
+    return generators.abs().sum(-1) * (1.0 + 2 * (generators.shape[-1] + 8) * UNIT)
 
 
 def _overflow(lowers, uppers, center, generators, reach):

@@ -20,15 +20,47 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.form import Form, Operation, registers
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
 
 _SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and error factors themselves
+
+
+class Relaxed(NamedTuple):
+    """One nonlinear operation of a step, as the forward pass met it: all that a backward pass needs (tensors only, no cycle).
+
+    Attributes:
+        name: of the operation.
+        band: the one used.
+        radius: of the variables it added, rounding included: the band's error is ``radius * z``, ``(*batch, ...)``.
+        first: index of the first of them.
+        center, coefficients, magnitude, error: the input's form.
+        lower, upper: the input's bounds that the band was made for (None for a product, which has a band of its own).
+        operation, parameters: how to get lines for those bounds; None for a product and where there is nothing but the band.
+    """
+
+    name: str
+    band: Band
+    radius: Tensor
+    first: int
+    center: Tensor
+    coefficients: Tensor
+    magnitude: Tensor
+    error: float
+    lower: Tensor | None = None
+    upper: Tensor | None = None
+    operation: Operation | None = None
+    parameters: tuple[Any, ...] = ()
+
+
+Hints = Sequence[tuple[Tensor, Tensor] | None]
+"""Bounds known from elsewhere of each operation's input, in the order of evaluation."""
 
 
 class StepFrame:
@@ -39,11 +71,13 @@ class StepFrame:
         reach: an upper bound of ``|z_i|`` for states, ``(*batch, n)``.
         disturbance_radius: of the disturbance variables, ``(d,)``.
         size: number of variables so far.
-        bands: bands used in this step, in the order of evaluation (for certificates and the backward pass).
-        slopes: slopes to use instead of the default ones, in the order of evaluation.
+        relaxations: the nonlinear operations of this step, in the order of evaluation.
+        hints: bounds of their inputs, intersected with what the forms give.
     """
 
-    def __init__(self, generators: Tensor, reach: Tensor, disturbance_radius: Tensor) -> None:
+    def __init__(
+        self, generators: Tensor, reach: Tensor, disturbance_radius: Tensor, *, hints: Hints | None = None
+    ) -> None:
         self.generators = generators
         self.reach = reach
         self.disturbance_radius = disturbance_radius
@@ -52,7 +86,18 @@ class StepFrame:
         self.inputs = self.states + disturbance_radius.shape[-1]
         self.size = self.inputs
         self.batch = generators.shape[:-2]
-        self.bands: list[tuple[str, Band]] = []
+        self.relaxations: list[Relaxed] = []
+        self.hints = hints
+
+    @property
+    def bands(self) -> list[tuple[str, Band]]:
+        """Names and bands of the operations, in the order of evaluation."""
+        return [(r.name, r.band) for r in self.relaxations]
+
+    def narrowed(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        """The bounds of the next operation's input, intersected with what is known of it."""
+        hint = None if self.hints is None else self.hints[len(self.relaxations)]
+        return (lower, upper) if hint is None else (torch.maximum(lower, hint[0]), torch.minimum(upper, hint[1]))
 
     @property
     def sum_error(self) -> float:
@@ -83,7 +128,7 @@ class StepFrame:
         return unit.reshape(self.inputs, *[1] * len(self.batch), last - first).expand(shape)
 
 
-class AffineForm:
+class AffineForm(Form):
     """An enclosed value of shape ``shape``; see the module."""
 
     __slots__ = ("center", "coefficients", "error", "frame", "magnitude")
@@ -138,6 +183,10 @@ class AffineForm:
             coefficients = coefficients.reshape(coefficients.shape[0], *batch, -1)
         return coefficients.movedim(0, -1)
 
+    def rounding(self) -> Tensor:
+        """Upper bound of the rounding error carried, plus that of :meth:`spread`."""
+        return self.magnitude * ((self.error + (2 * self.frame.states + 16) * UNIT) * _SAFETY)
+
     def slack(self) -> Tensor:
         """Upper bound of the rounding error carried, plus that of summing up a radius and of one subtraction."""
         return self.magnitude * ((self.error + self.frame.sum_error) * _SAFETY)
@@ -170,13 +219,25 @@ class AffineForm:
             self.error,
         )
 
-    def relaxed(self, name: str, band: Band) -> AffineForm:
-        """The form of ``f(self)`` for a band of f over :meth:`bounds`."""
+    def relaxed(self, name: str, operation: Operation, *parameters: Any) -> AffineForm:
+        """The form of ``f(self)``: f's band over :meth:`bounds`."""
+        lower, upper = self.frame.narrowed(*self.bounds())
+        return self._within(name, operation.band(lower, upper, *parameters), lower, upper, operation, parameters)
+
+    def widened(self, name: str, band: Band) -> AffineForm:
+        """The form of ``slope * self + offset + [-radius, radius]``."""
+        return self._within(name, band)
+
+    def _within(self, name: str, band: Band, *made_of: Any) -> AffineForm:
         frame = self.frame
         slope, offset, radius = band
         magnitude = slope.abs() * self.magnitude + offset.abs() + (radius + TINY)
         radius = radius * _SAFETY + magnitude * ((self.error + 4 * UNIT) * _SAFETY)
-        frame.bands.append((name, band))
+        frame.relaxations.append(
+            Relaxed(
+                name, band, radius, frame.size, self.center, self.coefficients, self.magnitude, self.error, *made_of
+            )
+        )
         return self._with_fresh(self.center * slope + offset, self.coefficients * slope, magnitude, radius)
 
     def _with_fresh(self, center: Tensor, coefficients: Tensor, magnitude: Tensor, radius: Tensor) -> AffineForm:
@@ -193,103 +254,16 @@ class AffineForm:
         frame.size += events
         return AffineForm(frame, center, torch.cat([coefficients, fresh]), magnitude + radius, 4 * UNIT)
 
-    # -- operators -----------------------------------------------------------------------------------------------
-
-    def __add__(self, other: Any) -> AffineForm:
-        return add(self, other)
-
-    __radd__ = __add__
-
-    def __neg__(self) -> AffineForm:
-        return AffineForm(self.frame, -self.center, -self.coefficients, self.magnitude, self.error)
-
-    def __sub__(self, other: Any) -> AffineForm:
-        return add(self, -other)
-
-    def __rsub__(self, other: Any) -> AffineForm:
-        return add(-self, other)
-
-    def __mul__(self, other: Any) -> AffineForm:
-        return multiply(self, other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: Any) -> AffineForm:
-        return torch.div(self, other)
-
-    def __rtruediv__(self, other: Any) -> AffineForm:
-        return torch.div(other, self)
-
-    def __pow__(self, exponent: Any) -> AffineForm:
-        return torch.pow(self, exponent)
-
-    def __rpow__(self, base: Any) -> AffineForm:
-        return torch.pow(base, self)
-
-    def __abs__(self) -> AffineForm:
-        return torch.abs(self)
-
-    def __bool__(self) -> bool:
-        raise UnsupportedOperationError(
-            "a step may not branch on a value: the truth of a set is not one of True and False; "
-            "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
-        )
-
-    def _compare(self, other: Any) -> bool:
-        return self.__bool__()
-
-    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
-    __hash__ = object.__hash__
-
-    def __matmul__(self, other: Any) -> AffineForm:
-        return torch.matmul(self, other)
-
     def __getitem__(self, index: Any) -> AffineForm:
         index = index if isinstance(index, tuple) else (index,)
         return self._linear(lambda t: t[index], lambda t: t[(slice(None), *index)])
 
-    def __getattr__(self, name: str) -> Any:
-        method = getattr(torch.Tensor, name, None)
-        if method is None or name.startswith("__"):
-            raise AttributeError(name)
-        if not callable(method):
-            raise _unsupported(name)
-        return lambda *args, **kwargs: _dispatch(method, (self, *args), kwargs)
-
-    @classmethod
-    def __torch_function__(
-        cls, function: Callable[..., Any], types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
-    ) -> Any:
-        return _dispatch(function, args, kwargs or {})
-
 
 HANDLERS: dict[Any, Callable[..., Any]] = {}
-"""Torch function to its implementation on forms; one line per function."""
+"""Torch function to its implementation on affine forms; one line per function."""
 
-
-def handles(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register an implementation for torch functions or methods."""
-
-    def register(implementation: Callable[..., Any]) -> Callable[..., Any]:
-        for f in functions:
-            HANDLERS[f] = implementation
-        return implementation
-
-    return register
-
-
-def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    handler = HANDLERS.get(function)
-    if handler is None:
-        raise _unsupported(getattr(function, "__name__", str(function)))
-    return handler(*args, **kwargs)
-
-
-def _unsupported(name: str) -> UnsupportedOperationError:
-    return UnsupportedOperationError(
-        f"torch operation '{name}' has no relaxation in the affine propagator; "
-        f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
-    )
+AffineForm.handlers = HANDLERS
+handles = registers(HANDLERS)
 
 
 def _frame_of(*values: Any) -> StepFrame:
@@ -355,7 +329,7 @@ def reverse_subtract(a: Any, b: Any) -> AffineForm:
 @handles(torch.neg, torch.Tensor.neg, torch.Tensor.__neg__)
 def negate(a: AffineForm) -> AffineForm:
     """Negation (exact)."""
-    return -a
+    return AffineForm(a.frame, -a.center, -a.coefficients, a.magnitude, a.error)
 
 
 @handles(torch.mul, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
@@ -421,8 +395,10 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     larger, other = c.abs() * my, d.abs() * mx
     magnitude = larger + other + half + TINY  # |c| my >= |c d|, and half >= |middle|
     radius = half * _SAFETY + magnitude * ((2 * error + 16 * UNIT) * _SAFETY)
-    frame.bands.append(("product", Band(ratio, middle, half)))
-    return AffineForm(frame, c, gx, mx, error)._with_fresh(c * d + middle, c * gy + d * gx, magnitude, radius)
+    form = AffineForm(frame, c * d + middle, c * gy + d * gx, magnitude, error)
+    band = Band(ratio, middle, half)
+    frame.relaxations.append(Relaxed("product", band, radius, frame.size, form.center, form.coefficients, magnitude, error))
+    return form._with_fresh(form.center, form.coefficients, magnitude, radius)
 
 
 @handles(torch.nn.functional.linear)

@@ -40,7 +40,8 @@ class Recording:
 
         def stacked(part: int) -> Tensor:
             def entries(step: Sequence[tuple[str, Band]]) -> Tensor:
-                return torch.cat([band[part].expand(batch + _own(band, batch)).flatten(len(batch)) for _, band in step], -1)
+                rows = [band[part].expand(batch + _own(band, batch)).reshape(*batch, -1) for _, band in step]
+                return torch.cat(rows, -1)
 
             return torch.stack([entries(step) if step else torch.zeros(*batch, 0) for step in bands], dim=-2).double()
 

@@ -27,7 +27,8 @@ def reduce_generators(generators: Tensor, limit: int) -> tuple[Tensor, Tensor]:
     if count <= limit:
         return generators, mask
     size = generators.abs()
-    # What boxing costs: a generator along an axis loses nothing, so rank by 1-norm minus largest entry, per unit of state scale.
+    # What boxing costs: a generator along an axis loses nothing, so rank by 1-norm minus largest entry, per unit of
+    # state scale.
     scale = size.sum(-1, keepdim=True).clamp(min=1e-300)
     weight = size / scale
     loss = weight.sum(-2) - weight.amax(-2)

@@ -22,6 +22,7 @@ from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.reachability.partition import partition
 from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.verdict import Outcome, Verdict, assess
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
@@ -47,6 +48,7 @@ class Verification:
         seconds: share of the propagation time, ``(R,)``.
         propagator: its name.
         rigorous: whether rounding is included in the tubes.
+        recording: the relaxations used, batched ``(R, C)``; None if the propagator keeps none.
     """
 
     references: Tensor
@@ -63,6 +65,7 @@ class Verification:
     seconds: Tensor
     propagator: str
     rigorous: bool
+    recording: Recording | None = None
 
     def __len__(self) -> int:
         return self.references.shape[0]
@@ -87,6 +90,7 @@ class Verification:
             clearance=self.clearance[i],
             goal_margin=self.goal_margin[i],
             seconds=self.seconds[i],
+            recording=None if self.recording is None else self.recording.select(i),
         )
 
     @staticmethod
@@ -109,6 +113,7 @@ class Verification:
             clearance=cat([p.clearance for p in parts]),
             goal_margin=cat([p.goal_margin for p in parts]),
             seconds=cat([p.seconds for p in parts]),
+            recording=Recording.join([p.recording for p in parts]),
         )
 
 
@@ -167,25 +172,27 @@ def verify_references(
     flat_lower, flat_upper = cells.lower.reshape(-1, n), cells.upper.reshape(-1, n)
 
     parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    recordings: list[Recording | None] = []
     seconds = torch.zeros(count, dtype=torch.float64)
     with (progress or Silent()).task("propagating cells", len(owner)) as task, torch.no_grad():
         for begin in range(0, len(owner), cells_at_once):
             some = slice(begin, begin + cells_at_once)
             began = time.perf_counter()
-            parts.append(
-                _bound(
-                    propagator,
-                    ClosedLoop(dynamics, tracker, references[owner[some]]),
-                    Box(flat_lower[some], flat_upper[some]),
-                    disturbance,
-                )
+            *bounds, recording = _bound(
+                propagator,
+                ClosedLoop(dynamics, tracker, references[owner[some]]),
+                Box(flat_lower[some], flat_upper[some]),
+                disturbance,
             )
+            parts.append(tuple(bounds))
+            recordings.append(recording)
             share = (time.perf_counter() - began) / len(owner[some])
             seconds += share * torch.bincount(owner[some], minlength=count)
             task.advance(len(owner[some]))
     lower, upper, u_lower, u_upper = (
         torch.cat(p).unflatten(0, (count, per_reference)) for p in zip(*parts, strict=True)
     )
+    recording = Recording.join(recordings) if recordings else None
     tube = Tube(lower, upper)
     assessment = assess(tube, scene, position=dynamics.position, state_names=dynamics.state_names)
     return Verification(
@@ -203,17 +210,22 @@ def verify_references(
         seconds=seconds,
         propagator=propagator.name,
         rigorous=propagator.rigorous,
+        recording=None if recording is None else recording.unflatten((count, per_reference)),
     )
 
 
 def _bound(
     propagator: Propagator, loop: ClosedLoop, start: Box, disturbance: Box
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Bounds of states ``(B, K+1, n)`` and controls ``(B, K, m)``."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Recording | None]:
+    """Bounds of states ``(B, K+1, n)`` and controls ``(B, K, m)``, and the relaxations if the propagator keeps them."""
+    prove = getattr(propagator, "prove", None)
+    if prove is not None:
+        tube, u_lower, u_upper, recording = prove(loop, start, disturbance)
+        return tube.lower, tube.upper, u_lower, u_upper, recording
     with_controls = getattr(propagator, "propagate_with_controls", None)
     if with_controls is not None:
         tube, u_lower, u_upper = with_controls(loop, start, disturbance)
-        return tube.lower, tube.upper, u_lower, u_upper
+        return tube.lower, tube.upper, u_lower, u_upper, None
     tube = propagator.propagate(loop, start, disturbance)
     unknown = torch.full((*tube.lower.shape[:-2], loop.horizon, loop.dynamics.control_dim), torch.inf)
-    return tube.lower, tube.upper, -unknown.double(), unknown.double()
+    return tube.lower, tube.upper, -unknown.double(), unknown.double(), None

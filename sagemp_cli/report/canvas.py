@@ -157,9 +157,7 @@ def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
     return len(fits) if fits.all() else int(fits.argmin())
 
 
-def tube_boxes(
-    axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3, of: int | None = None
-) -> None:
+def tube_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3, of: int | None = None) -> None:
     """A tube's cross-sections ``(steps, 2)`` over the plane, coloured by time, the latest in front; ``of`` K + 1."""
     shade = TIME(np.arange(len(lower)) / max(1, (of or len(lower)) - 1))
     draw_boxes(axes, lower, upper, facecolors=shade, edgecolors="none", alpha=alpha, zorder=3)

@@ -117,9 +117,7 @@ def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alp
     axes.plot(*path.T, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=7)
 
 
-def _band(
-    axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, reference: int, state: int
-) -> None:
+def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, reference: int, state: int) -> None:
     """Bounds of one state, cell by cell; where the tube outgrows the workspace it ends at a dashed line."""
     mine, colour = tubes.cell_reference == reference, MODES[reference % len(MODES)]
     steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])

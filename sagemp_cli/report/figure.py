@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sagemp_cli.errors import ResourceError
+from sagemp_cli.storage.atomic import write_whole
 
 
 def draw_beside(artifact: Path, draw: Callable[..., Figure], *artifacts: Any) -> Path:
@@ -25,19 +24,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     Raises:
         ResourceError: the folder cannot be written or the disk is full.
     """
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", metadata={"Software": "sagemp"})
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be written: {e.strerror or e}") from e
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-    return path
+    FigureCanvasAgg(figure)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", metadata={"Software": "sagemp"})
+    return write_whole(path, drawn.getvalue(), overwrite=True)

@@ -6,10 +6,11 @@ import numpy as np
 import torch
 
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.verdict import Outcome, Verdict
 from sagemp_cli.reachability.verification import Verification
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.storage import Tubes
+from sagemp_cli.storage import Relaxations, Tubes
 
 
 def tubes_record(v: Verification) -> Tubes:
@@ -37,7 +38,30 @@ def tubes_record(v: Verification) -> Tubes:
         seconds=v.seconds.numpy(),
         propagator=v.propagator,
         rigorous=v.rigorous,
+        relaxations=None if v.recording is None else _relaxations(v.recording.flatten()),
     )
+
+
+def _relaxations(recording: Recording) -> Relaxations:
+    return Relaxations(
+        operations=recording.operations,
+        widths=np.array(recording.widths, dtype=np.int64),
+        slope=recording.slope.numpy(),
+        offset=recording.offset.numpy(),
+        radius=recording.radius.numpy(),
+        kept=None if recording.kept is None else recording.kept.numpy(),
+    )
+
+
+def _recording(record: Relaxations, sizes: tuple[int, int]) -> Recording:
+    return Recording(
+        record.operations,
+        tuple(record.widths.tolist()),
+        torch.from_numpy(record.slope),
+        torch.from_numpy(record.offset),
+        torch.from_numpy(record.radius),
+        None if record.kept is None else torch.from_numpy(record.kept),
+    ).unflatten(sizes)
 
 
 def verification_of(record: Tubes, where: str) -> Verification:
@@ -76,4 +100,5 @@ def verification_of(record: Tubes, where: str) -> Verification:
         seconds=torch.from_numpy(record.seconds),
         propagator=record.propagator,
         rigorous=bool(record.rigorous),
+        recording=None if record.relaxations is None else _recording(record.relaxations, (count, cells)),
     )

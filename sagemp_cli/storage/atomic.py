@@ -51,7 +51,9 @@ def write_whole(path: Path, data: bytes, *, overwrite: bool = False) -> Path:
         _take_name(temporary, path, overwrite)
         _sync_folder(path.parent)
     except OSError as e:
-        raise ResourceError(f"{path}: cannot be written: {reason_of(e)}") from e
+        blocker = next((folder for folder in path.parents if folder.is_file()), None)
+        why = reason_of(e) if blocker is None else f"{blocker} is a file where a folder is needed"
+        raise ResourceError(f"{path}: cannot be written: {why}") from e
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
@@ -73,8 +75,6 @@ def reason_of(error: BaseException) -> str:
         return "no space left on the disk"
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
         return "the folder or file is read-only"
-    if number in (errno.ENOTDIR, errno.EEXIST):
-        return f"{getattr(error, 'filename', None) or 'part of the path'} is a file where a folder is needed"
     return " ".join(str(error).split()) or type(error).__name__
 
 

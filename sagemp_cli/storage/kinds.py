@@ -66,6 +66,20 @@ class TrackerModel:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Relaxations:
+    """The relaxations of a proof, from which it can be done again (see ``docs/certificates.md``)."""
+
+    operations: tuple[str, ...] = texts("operations", "nonlinear operations of a step, in the order of evaluation")
+    widths: np.ndarray = array("operations", "entries of each operation", dtype="int64")
+    slope: np.ndarray = array("cells K entries", "slope of each line (scale of a product)", finite=False)
+    offset: np.ndarray = array("cells K entries", "offset of each line", finite=False)
+    radius: np.ndarray = array("cells K entries", "greatest distance of the function from the line", finite=False)
+    kept: np.ndarray | None = array(
+        "cells K bytes", "which generators were kept after each step, one bit each", dtype="uint8", optional=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Tubes:
     """References, their tubes and the verdicts (the body of ``verify``'s certificate and of a library)."""
 
@@ -94,6 +108,7 @@ class Tubes:
     seconds: np.ndarray = array("count", "share of the proof time", units="s")
     propagator: str = scalar("propagator that made the tubes")
     rigorous: bool = scalar("whether rounding is included in the tubes")
+    relaxations: Relaxations | None = group(Relaxations, "what the proof can be done again from", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,7 @@ class TubeLoss:
     symbols: int = 50
     scale: Sequence[float] | float = 0.1
     end: float = 1.0
-    shrink: float = 0.25
+    shrink: float = 0.15
 
     def __post_init__(self) -> None:
         if not 0 < self.shrink <= 1:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import importlib
 from types import SimpleNamespace
 
@@ -10,8 +12,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sagemp_cli import config as config_module
 from sagemp_cli.cli.main import app
 from sagemp_cli.stages.stage import STAGES
+
+_composed = functools.cache(config_module._composed)
+
+
+@pytest.fixture(autouse=True)
+def quick_config(monkeypatch):
+    """Hydra composes each config once for all tests of this folder: it takes longer than everything else here."""
+    monkeypatch.setattr(config_module, "_composed", lambda overrides: copy.deepcopy(_composed(tuple(overrides))))
 
 
 @pytest.fixture
@@ -49,7 +60,8 @@ def made_up(monkeypatch, example):
                     constraint_names=("workspace", "lower disc"),
                     clearance=np.array([[1.5, 0.25]]),
                 )
-                record = dataclasses.replace(record, tubes=tubes, **state.certificate)
+                found = () if safe else record.counterexamples
+                record = dataclasses.replace(record, tubes=tubes, counterexamples=found, **state.certificate)
             path = context.write(stage.name, record, parents)
             path.with_suffix(".png").write_bytes(b"a figure")
             return path

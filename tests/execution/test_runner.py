@@ -103,7 +103,9 @@ def test_every_rollout_stays_in_its_tube_and_the_closest_reference_is_tracked(li
 
 def test_a_start_outside_every_certified_box_is_refused(library, cart, tracker):
     starts = torch.tensor([[0.0, 0.0], [0.31, 0.0]], dtype=torch.float64)
-    with pytest.raises(UsageError, match=r"measured start \[0.31, 0.0\] lies in the start box X_I of none of 2 certified"):
+    with pytest.raises(
+        UsageError, match=r"measured start \[0.31, 0.0\] lies in the start box X_I of none of 2 certified"
+    ):
         run(library, cart, tracker, starts=starts, propose=lambda s: plans(0.0, 0.0))
 
 
@@ -141,7 +143,9 @@ def test_worst_case_disturbances_reach_the_exact_tube_of_an_affine_loop(library,
 
 def test_a_rollout_that_leaves_one_of_its_cells_is_not_inside():
     cells = Box([[0.0], [1.0]], [[1.0], [2.0]])
-    tubes = Tube(torch.tensor([[[0.0], [0.0]], [[1.0], [5.0]]]).double(), torch.tensor([[[1.0], [1.0]], [[2.0], [6.0]]]).double())
+    tubes = Tube(
+        torch.tensor([[[0.0], [0.0]], [[1.0], [5.0]]]).double(), torch.tensor([[[1.0], [1.0]], [[2.0], [6.0]]]).double()
+    )
     states = torch.tensor([[[0.5], [0.5]], [[0.5], [5.5]], [[1.5], [5.5]], [[1.0], [0.5]], [[3.0], [5.5]]]).double()
     # In the first cell; out of it; in the second; on the common face but in one tube only; in no cell at all.
     assert inside_tube(states, cells, tubes).tolist() == [True, False, True, False, False]

@@ -12,9 +12,7 @@ from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
 
 K, POSITION = 4, (0, 1)
-SCENE = Scene(
-    Box([-5.0, -5.0], [5.0, 5.0]), (Ball((2.0, 2.0), 0.5, "disc"),), Box([3.0, -1.0, -9.0], [5.0, 1.0, 9.0])
-)
+SCENE = Scene(Box([-5.0, -5.0], [5.0, 5.0]), (Ball((2.0, 2.0), 0.5, "disc"),), Box([3.0, -1.0, -9.0], [5.0, 1.0, 9.0]))
 GOOD, CRASH, SHORT, OUTSIDE = "good", "crash", "short", "outside"
 
 
@@ -143,7 +141,8 @@ def test_nothing_certified_is_an_error_with_the_account():
     with pytest.raises(NothingCertifiedError) as caught:
         build([CRASH, CRASH, SHORT], wanted=1)
     assert str(caught.value) == (
-        "library: none of 3 sampled references could be certified (2 x reference in collision, 1 x reference misses goal)"
+        "library: none of 3 sampled references could be certified "
+        "(2 x reference in collision, 1 x reference misses goal)"
     )
     assert caught.value.exit_code == 5
 

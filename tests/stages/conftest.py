@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from sagemp_cli.config import compose
 from sagemp_cli.stages.stage import StageContext, stage_named
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Two records hold the same bits, except for the seconds that were measured."""
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            if field.name != "seconds":
+                assert_same(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_array_equal(a, b)
+    else:
+        assert a == b
 
 
 class Interrupt:

@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -8,24 +6,7 @@ from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import Demonstrations, PlannerModel, TrackerModel, read_artifact
 
-from .conftest import Interrupt
-
-_MEASURED = ("seconds",)
-
-
-def assert_same(a, b):
-    for field in dataclasses.fields(a):
-        left, right = getattr(a, field.name), getattr(b, field.name)
-        if field.name in _MEASURED:
-            continue
-        if dataclasses.is_dataclass(left):
-            assert_same(left, right)
-        elif isinstance(left, dict):
-            assert left.keys() == right.keys()
-            for key in left:
-                np.testing.assert_array_equal(left[key], right[key])
-        else:
-            np.testing.assert_array_equal(left, right)
+from .conftest import Interrupt, assert_same
 
 
 def test_gen_data_goes_on_where_it_was_interrupted(work, toy_folder):
@@ -62,7 +43,7 @@ def test_more_demonstrations_keep_the_finished_ones_and_another_expert_does_not(
     ("name", "record", "needs", "overrides"),
     [
         ("train-planner", PlannerModel, ("gen-data",), ("planner_training.steps=120",)),
-        ("train-tracker", TrackerModel, ("gen-data", "train-planner"), ("training.steps=25",)),
+        ("train-tracker", TrackerModel, ("gen-data", "train-planner"), ("training.steps=25", "training.tube_steps=2")),
     ],
 )
 def test_training_goes_on_where_it_was_interrupted_and_ends_in_the_same_bits(work, name, record, needs, overrides):

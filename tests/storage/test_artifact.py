@@ -182,7 +182,7 @@ def test_an_unbounded_tube_can_be_stored(example, tmp_path):
 def test_random_damage_never_escapes_as_anything_but_a_one_line_error(example, tmp_path):
     whole = write_artifact(tmp_path / "a.h5", example(Certificate), HEADER).read_bytes()
     path, draw, refused = tmp_path / "b.h5", random.Random(0), 0
-    for _ in range(150):
+    for _ in range(60):
         data = bytearray(whole)
         for _ in range(draw.choice([1, 4, 64])):
             data[draw.randrange(len(data))] = draw.randrange(256)
@@ -194,4 +194,4 @@ def test_random_damage_never_escapes_as_anything_but_a_one_line_error(example, t
             assert e.exit_code == 2
             assert str(path) in str(e)
             assert "\n" not in str(e)
-    assert refused > 50
+    assert refused > 15

@@ -15,10 +15,12 @@ TEXT = (Path(__file__).parents[2] / "docs" / "artifacts.md").read_text(encoding=
 def records():
     """Every record class with the heading of its section."""
     found = {kind.record: f"## {kind.name}" for kind in KINDS}
-    for record in list(found):
-        for f in dataclasses.fields(record):
-            if f.metadata["form"] == "group":
+    waiting = list(found)
+    while waiting:
+        for f in dataclasses.fields(waiting.pop()):
+            if f.metadata["form"] == "group" and f.metadata["record"] not in found:
                 found[f.metadata["record"]] = f"### {f.metadata['record'].__name__}"
+                waiting.append(f.metadata["record"])
     return found.items()
 
 

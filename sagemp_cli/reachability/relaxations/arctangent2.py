@@ -1,8 +1,8 @@
 """The angle of a point, ``atan2(y, x)``, as an arc tangent of the smaller coordinate over the larger one.
 
-Right of the diagonals ``atan(y / x)``, above and below them ``+-pi/2 - atan(x / y)``, left of them ``+-pi + atan(y / x)``: which of
-these forms holds on a whole box is decided by its ends. A box that meets the negative x axis (where the angle jumps) or
-the origin has no single form; its angle is anywhere in ``[-pi, pi]``.
+Right of the diagonals ``atan(y / x)``, above and below them ``+-pi/2 - atan(x / y)``, left of them ``+-pi + atan(y /
+x)``: which of these forms holds on a whole box is decided by its ends. A box that meets the negative x axis (where
+the angle jumps) or the origin has no single form; its angle is anywhere in ``[-pi, pi]``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Quadrant(NamedTuple):
     Attributes:
         upright: where the quotient is x / y; else it is y / x.
         known: where there is a form at all.
-        turned: what to do with the arc tangent of the quotient: multiply it by the slope and add the offset, up to the radius.
+        turned: what to do with the arc tangent of the quotient: multiply it by the slope and add the offset, up to
+            the radius.
     """
 
     upright: Tensor
@@ -44,13 +45,11 @@ def quadrant(y_lower: Tensor, y_upper: Tensor, x_lower: Tensor, x_upper: Tensor)
     offset = torch.where(upright, 0.5 * math.pi * y_sign, torch.where(x_upper < 0, math.pi * y_sign, zero))
     slope = torch.where(upright, -1.0, 1.0).to(zero)
     radius = torch.where(known, offset.abs() * 2.0**-52, zero + math.pi * (1.0 + 2.0**-50))
-    return Quadrant(
-        upright, known, Band(torch.where(known, slope, zero), torch.where(known, offset, zero), radius)
-    )
+    return Quadrant(upright, known, Band(torch.where(known, slope, zero), torch.where(known, offset, zero), radius))
 
 
 def value_range(y_lower: Tensor, y_upper: Tensor, x_lower: Tensor, x_upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds of the angle over a box: those at its corners (plus 8 ulps of pi) if it does not meet the jump or the origin."""
+    """Bounds over a box: those at its corners, plus 8 ulps of pi; the whole circle if it meets the jump."""
     corners = torch.stack([torch.atan2(y, x) for y in (y_lower, y_upper) for x in (x_lower, x_upper)])
     known = ((x_lower > 0) | (y_lower > 0) | (y_upper < 0)) & torch.isfinite(corners).all(0)
     margin, whole = 8 * math.pi * 2.0**-52, math.pi * (1.0 + 2.0**-50)

@@ -18,8 +18,8 @@ TINY = 1e-250
 class Band(NamedTuple):
     """``|f(x) - slope x - offset| <= radius`` for every real x of the interval, in real arithmetic.
 
-    ``slope``, ``offset`` and ``radius >= 0`` are the exact float64 numbers stored; all rounding made in finding them is inside ``radius``.
-    A band that claims nothing has an infinite radius, slope 0 and offset 0.
+    ``slope``, ``offset`` and ``radius >= 0`` are the exact float64 numbers stored; all rounding made in finding them
+    is inside ``radius``. A band that claims nothing has an infinite radius, slope 0 and offset 0.
     """
 
     slope: Tensor
@@ -30,8 +30,8 @@ class Band(NamedTuple):
 def settled(slope: Tensor, offset: Tensor, radius: Tensor) -> Band:
     """The band, which claims nothing where its radius came out as NaN or infinite.
 
-    Every relaxation's radius is not finite if the interval or anything computed from it is not, so the radius alone is asked:
-    one sum in the usual case.
+    A relaxation's radius is not finite if the interval or anything computed from it is not, so the radius alone is
+    asked: one sum in the usual case.
     """
     if math.isfinite(radius.detach().sum().item()):
         return Band(slope, offset, radius)

@@ -1,9 +1,9 @@
 """Clamp to limits, ``min(max(x, lo), hi)``: saturated inputs, hard tanh, ReLU6. Either limit may be missing (infinite).
 
-Flat, rising, flat: with slope ``a`` the excess is extreme at the ends or at the kinks, so four points decide. The band's best
-slope is the smaller of two: from the left end to the upper kink (or the right end), and from the lower kink (or the left
-end) to the right end. Lower than both, the radius falls with the slope, because the extremes are the two kinks; higher
-than either, it rises.
+Flat, rising, flat: with slope ``a`` the excess is extreme at the ends or at the kinks, so four points decide. The
+band's best slope is the smaller of two: from the left end to the upper kink (or the right end), and from the lower kink
+(or the left end) to the right end. Lower than both, the radius falls with the slope, because the extremes are the two
+kinks; higher than either, it rises.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sagemp_cli.reachability.relaxations.lines import Lines
 
 
 def band(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor) -> Band:
-    """The band of smallest radius on ``[lower, upper]``; as in torch, ``maximum`` wins where it lies below ``minimum``."""
+    """The band of smallest radius on ``[lower, upper]``; as in torch, maximum wins where it is below minimum."""
     points, values = _corners(lower, upper, minimum, maximum)
     rise_left, rise_right = _slopes(points, values)
     slope = torch.minimum(rise_left, rise_right)
@@ -51,9 +51,7 @@ def _clamp(x: Tensor, minimum: float | Tensor, maximum: float | Tensor) -> Tenso
     return x.clamp(min=minimum).clamp(max=maximum)
 
 
-def _corners(
-    lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor
-) -> tuple[Tensor, Tensor]:
+def _corners(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor) -> tuple[Tensor, Tensor]:
     """Left end, lower kink, upper kink, right end (kinks moved into the interval), and the values there; exact."""
     left, right = (torch.minimum(lower.clamp(min=limit), upper) for limit in (minimum, maximum))
     points = torch.stack(torch.broadcast_tensors(lower, left, right, upper))

@@ -14,7 +14,7 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
 
 ULPS = 4
-"""Margin allowed to ``torch.expm1`` and ``torch.exp``, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.expm1`` and ``torch.exp``, in ulps of the result; tested against ball arithmetic."""
 
 
 def _value(x: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
 
 ULPS = 4
-"""Margin allowed to ``torch.exp``, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.exp``, in ulps of the result; tested against ball arithmetic."""
 
 CURVE = Curve(
     torch.exp,

@@ -1,4 +1,4 @@
-"""Leaky ReLU (and ReLU, slope 0): ``f(x) = max(x, s x)``, ``s <= 1``; a negative s is allowed (-1 gives the absolute value)."""
+"""Leaky ReLU ``f(x) = max(x, s x)`` with ``s <= 1``: ReLU for s = 0, the absolute value for s = -1."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | No
     ``max((s - a) lower, (1 - a) upper)`` (at the ends), so the band is exact up to rounding, whatever ``a``.
     """
     slope, gap = _chord_and_gap(lower, upper, negative_slope, slope)
-    # Two roundings in the gap and one in the half: 4 UNIT; an upper bound of the gap gives an upper bound of both halves.
+    # Two roundings in the gap and one in the half: 4 UNIT; an upper bound of the gap gives an upper bound of both
+    # halves.
+
     half = gap * (0.5 + 4 * UNIT)
     return settled(slope, half, half)
 
@@ -37,12 +39,11 @@ def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Te
     return increasing(lambda x: torch.nn.functional.leaky_relu(x, negative_slope), lower, upper, ulps=1)
 
 
-def _chord_and_gap(
-    lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None) -> tuple[Tensor, Tensor]:
     """The chord's slope (if none is given) and the largest ``f(x) - slope x``.
 
-    Ends on the far side of the kink are moved to the kink, or just past it: then no product below can underflow and no quotient is 0/0.
+    Ends on the far side of the kink are moved to the kink, or just past it: then no product below can underflow and
+    no quotient is 0/0.
     """
     low, high = lower.clamp(max=-TINY), upper.clamp(min=TINY)
     if slope is None:

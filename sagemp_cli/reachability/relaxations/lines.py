@@ -14,8 +14,8 @@ from sagemp_cli.reachability.relaxations.band import UNIT, Band
 class Lines(NamedTuple):
     """``lower_slope x + lower_offset <= f(x) <= upper_slope x + upper_offset`` for every real x of the interval.
 
-    Four exact float64 numbers per entry, in real arithmetic; the rounding made in finding them is inside the offsets. Lines that
-    claim nothing have slope 0 and infinite offsets.
+    Four exact float64 numbers per entry, in real arithmetic; the rounding made in finding them is inside the offsets.
+    Lines that claim nothing have slope 0 and infinite offsets.
     """
 
     lower_slope: Tensor
@@ -45,7 +45,7 @@ def settled(lines: Lines) -> Lines:
 
 
 def choose(first: Lines, second: Lines, middle: Tensor) -> Lines:
-    """Of two pairs the better line on each side: the one closer to the graph at the interval's middle, which has the smaller area."""
+    """Of two pairs of lines the better one on each side: closer to the graph at the middle, so of smaller area."""
     below = second.lower_slope * middle + second.lower_offset > first.lower_slope * middle + first.lower_offset
     above = second.upper_slope * middle + second.upper_offset < first.upper_slope * middle + first.upper_offset
     return Lines(

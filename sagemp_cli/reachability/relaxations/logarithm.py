@@ -14,7 +14,7 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import outward
 
 ULPS = 4
-"""Margin allowed to ``torch.log``, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.log``, in ulps of the result; tested against ball arithmetic."""
 
 _SMALLEST = 1e-300  # of arguments: below, the derivative comes near to what float64 can hold
 

@@ -1,18 +1,19 @@
 """Bands and lines of smooth functions that are convex or concave piece by piece.
 
-For a slope ``a`` let ``e(x) = f(x) - a x``. Where f is convex, e is largest at the ends of the piece, and for *any* point t
-of it ``e(x) >= e(t) + (f'(t) - a)(x - t)``. So a lower bound needs no certified root: t is where ``f'(t) = a`` as well as the
-machine knows, and what is left of ``f'(t) - a`` is paid for. Concave pieces are the same upside down. Every slope gives a
-sound band; which one is used decides only how tight it is.
+For a slope ``a`` let ``e(x) = f(x) - a x``. Where f is convex, e is largest at the ends of the piece, and for *any*
+point t of it ``e(x) >= e(t) + (f'(t) - a)(x - t)``. So a lower bound needs no certified root: t is where ``f'(t) =
+a`` as well as the machine knows, and what is left of ``f'(t) - a`` is paid for. Concave pieces are the same upside
+down. Every slope gives a sound band; which one is used decides only how tight it is.
 
-The best slope. The band's radius is a convex function of the slope, and so is the area under the upper line or over the
-lower one (each is a maximum of functions linear in the slope). On a single piece the chord is best for the band; where an
-interval holds an inflection the minimum is found by cutting planes: each evaluation adds the line that its extreme points
-define, and the next slope is where the last lines on either side meet (a Remez exchange).
+The best slope. The band's radius is a convex function of the slope, and so is the area under the upper line or over
+the lower one (each is a maximum of functions linear in the slope). On a single piece the chord is best for the band;
+where an interval holds an inflection the minimum is found by cutting planes: each evaluation adds the line that its
+extreme points define, and the next slope is where the last lines on either side meet (a Remez exchange).
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,18 +29,18 @@ from sagemp_cli.reachability.relaxations.lines import Lines
 _GOOD = 2e-4  # a slope whose objective is this close to the best, in units of the excess's range, is not refined
 
 Objective = Callable[["Excess", Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Value and derivative, with respect to the slope, of what a slope is chosen for; from the excess, the slope and the middle."""
+"""From excess, slope and middle: what is to be minimised and its derivative with respect to the slope."""
 
 
 class Piece(NamedTuple):
     """Where a function is convex (or concave).
 
     Attributes:
-        start, end: of the piece, numbers or tensors. Where they are inflections they may be off by rounding: the curvature
-            there is of that order too, and its effect of second order.
+        start, end: of the piece, numbers or tensors. Where they are inflections they may be off by rounding: the
+            curvature there is of that order too, and its effect of second order.
         convex: or concave.
-        touch: the point whose derivative is a given slope, as well as it can be had; arguments slope and the ends of that part of
-            the piece which lies in the interval. Any number is sound, NaN means the start.
+        touch: the point whose derivative is a given slope, as well as it can be had; arguments slope and the ends of
+            that part of the piece which lies in the interval. Any number is sound, NaN means the start.
     """
 
     start: float | Tensor
@@ -92,67 +93,65 @@ def band(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None =
         allowed: intervals inside the function's domain; elsewhere the band claims nothing.
     """
     lower, upper, outside = _confined(lower, upper, allowed)
-    slope = _chord(curve, lower, upper)
+    ends = torch.stack([lower, upper])
+    values = curve.value(ends)
+    slope = _chord(curve, ends, values)
     crossing = _crossing(curve, lower, upper)
-    if bool(crossing.any()):
-        slope = torch.where(crossing, _refined(curve, lower, upper, radius_objective), slope)
-    found = excess(curve, slope, lower, upper)
+    if crossing is not None and bool(crossing.any()):
+        slope = torch.where(crossing, _searched(curve, ends, values, radius_objective), slope)
+    found = excess(curve, slope, ends, values)
     radius = 0.5 * (found.most - found.least) + (found.most.abs() + found.least.abs()) * (2 * UNIT) + outside
     return settled(slope, 0.5 * (found.most + found.least), radius)
 
 
 def lines(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None = None) -> Lines:
-    """The lines of smallest area: on one piece the chord and the tangent at the middle; see the module for the others."""
+    """The lines of smallest area: on one piece the chord and the tangent at the middle, else found by search."""
     lower, upper, outside = _confined(lower, upper, allowed)
-    middle = 0.5 * lower + 0.5 * upper
-    slopes = [_chord(curve, lower, upper), curve.derivative(middle)]
-    if bool(_crossing(curve, lower, upper).any()):
-        slopes += [_refined(curve, lower, upper, objective) for objective in (upper_objective, lower_objective)]
+    ends = torch.stack([lower, upper])
+    values, middle = curve.value(ends), 0.5 * lower + 0.5 * upper
+    slopes = [_chord(curve, ends, values), curve.derivative(middle)]
+    crossing = _crossing(curve, lower, upper)
+    if crossing is not None and bool(crossing.any()):
+        slopes += [_searched(curve, ends, values, objective) for objective in (upper_objective, lower_objective)]
     best = None
     for slope in slopes:
-        found = excess(curve, slope, lower, upper)
+        found = excess(curve, slope, ends, values)
         pair = Lines(slope, found.least, slope, found.most)
         best = pair if best is None else _lines.choose(best, pair, middle)
     return _lines.settled(best._replace(upper_offset=best.upper_offset + outside))
 
 
-def excess(curve: Curve, slope: Tensor, lower: Tensor, upper: Tensor) -> Excess:
-    """Sound bounds of ``f(x) - slope x`` on ``[lower, upper]``, for any slope."""
-
-    def at(x: Tensor) -> tuple[Tensor, Tensor]:
-        value, line = curve.value(x), slope * x
-        return value - line, (value.abs() + line.abs()) * curve.margin + curve.floor
-
-    (first, first_error), (last, last_error) = at(lower), at(upper)
-    low_first, low_last = first - first_error, last - last_error
-    high_first, high_last = first + first_error, last + last_error
-    found = Excess(
-        torch.minimum(low_first, low_last),
-        torch.maximum(high_first, high_last),
-        torch.where(low_first <= low_last, lower, upper),
-        torch.where(high_first >= high_last, lower, upper),
-    )
+def excess(curve: Curve, slope: Tensor, ends: Tensor, values: Tensor) -> Excess:
+    """Sound bounds of ``f(x) - slope x`` between the ends ``(2, ...)``, for any slope; ``values`` are f at the ends."""
+    lower, upper = ends[0], ends[1]
+    at_ends, error = _tilted(curve, slope, ends, values)
+    low, high = at_ends - error, at_ends + error
+    least, most = low.amin(0), high.amax(0)
+    lowest, highest = torch.where(low[0] <= low[1], lower, upper), torch.where(high[0] >= high[1], lower, upper)
     for piece in curve.pieces:
         start, end = _part(piece.start, lower, upper), _part(piece.end, lower, upper)
-        if not bool((start < end).any()):
+        if len(curve.pieces) > 1 and not bool((start < end).any()):
             continue
-        t = torch.minimum(torch.fmax(piece.touch(slope, start, end), start), end)
-        value, error = at(t)
-        derivative = curve.derivative(t)
+        with torch.no_grad():  # any point of the piece will do, so for autograd it is a constant
+            t = torch.minimum(torch.fmax(piece.touch(slope, start, end), start), end)
+            derivative = curve.derivative(t)
+        at_t, error = _tilted(curve, slope, t, curve.value(t))
         tilt = derivative - slope
         left, right = (t - start) * tilt, (t - end) * tilt
         error = error + (end - start) * ((derivative.abs() + slope.abs() + curve.derivative_floor) * curve.margin)
         if piece.convex:
-            candidate = value - error - torch.maximum(left, right)
-            found = found._replace(
-                lowest=torch.where(candidate < found.least, t, found.lowest), least=torch.minimum(candidate, found.least)
-            )
+            bound = at_t - error - torch.maximum(left, right)
+            lowest, least = torch.where(bound < least, t, lowest), torch.minimum(bound, least)
         else:
-            candidate = value + error - torch.minimum(left, right)
-            found = found._replace(
-                highest=torch.where(candidate > found.most, t, found.highest), most=torch.maximum(candidate, found.most)
-            )
-    return found
+            bound = at_t + error - torch.minimum(left, right)
+            highest, most = torch.where(bound > most, t, highest), torch.maximum(bound, most)
+    return Excess(least, most, lowest, highest)
+
+
+def _tilted(curve: Curve, slope: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """``f(x) - slope x`` as computed, and a bound of its error."""
+    line = slope * x
+    return value - line, (value.abs() + line.abs()) * curve.margin + curve.floor
 
 
 def best_slope(
@@ -197,12 +196,12 @@ def best_slope(
 
 
 @torch.no_grad()
-def _refined(curve: Curve, lower: Tensor, upper: Tensor, objective: Objective) -> Tensor:
+def _searched(curve: Curve, ends: Tensor, values: Tensor, objective: Objective) -> Tensor:
     return best_slope(
-        lambda slope: excess(curve, slope, lower, upper),
-        lower,
-        upper,
-        values=(curve.value(lower), curve.value(upper)),
+        lambda slope: excess(curve, slope, ends, values),
+        ends[0],
+        ends[1],
+        values=(values[0], values[1]),
         objective=objective,
     )
 
@@ -224,23 +223,25 @@ def lower_objective(found: Excess, slope: Tensor, middle: Tensor) -> tuple[Tenso
 
 def _part(boundary: float | Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """A piece's boundary, moved into the interval."""
+    if isinstance(boundary, float) and math.isinf(boundary):
+        return lower if boundary < 0 else upper
     return torch.minimum(lower.clamp(min=boundary), upper)
 
 
-def _crossing(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor:
-    """Whether an inflection lies inside."""
-    crossing = torch.zeros_like(lower, dtype=torch.bool)
-    for piece in curve.pieces[1:]:
-        crossing = crossing | ((lower < piece.start) & (piece.start < upper))
-    return crossing
+def _crossing(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor | None:
+    """Whether an inflection lies inside; None if there is none at all."""
+    inside = [(lower < piece.start) & (piece.start < upper) for piece in curve.pieces[1:]]
+    return functools.reduce(torch.logical_or, inside) if inside else None
 
 
-def _chord(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor:
+def _chord(curve: Curve, ends: Tensor, values: Tensor) -> Tensor:
     """Slope of the chord, or where that would be rounding only, of the tangent at the middle."""
-    width = upper - lower
-    wide = width > 1e-6 * (lower.abs() + upper.abs()) + TINY
-    chord = (curve.value(upper) - curve.value(lower)) / torch.where(wide, width, torch.ones_like(width))
-    return torch.where(wide, chord, curve.derivative(0.5 * lower + 0.5 * upper))
+    width = ends[1] - ends[0]
+    wide = width > 1e-6 * ends.abs().sum(0) + TINY
+    rise = values[1] - values[0]
+    if bool(wide.all()):
+        return rise / width
+    return torch.where(wide, rise / torch.where(wide, width, 1.0), curve.derivative(0.5 * ends[0] + 0.5 * ends[1]))
 
 
 def _confined(lower: Tensor, upper: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor, Tensor | float]:

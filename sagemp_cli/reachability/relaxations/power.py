@@ -1,7 +1,7 @@
 """Integer powers ``x^n``, square and reciprocal among them.
 
-Even powers are convex (negative ones on either side of the pole); odd ones are concave left of 0 and convex right of it.
-An interval that holds the pole of a negative power has no band.
+Even powers are convex (negative ones on either side of the pole); odd ones are concave left of 0 and convex right of
+it. An interval that holds the pole of a negative power has no band.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import outward
 
 ULPS = 4
-"""Margin allowed to ``torch.pow`` with an integer exponent and to its derivative, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.pow`` with integer exponents, in ulps of the result; tested against ball arithmetic."""
 
 
 def band(lower: Tensor, upper: Tensor, exponent: int) -> Band:

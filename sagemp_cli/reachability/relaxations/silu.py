@@ -14,7 +14,7 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import outward
 
 ULPS = 4
-"""Margin allowed to the formulas below, in ulps of the result; tested against ball arithmetic."""
+"""Margin for the formulas below, in ulps of the result; tested against ball arithmetic."""
 
 INFLECTION = 2.3993572805154677
 """Where ``x tanh(x / 2) = 2``."""
@@ -38,7 +38,7 @@ def _derivative(x: Tensor) -> Tensor:
 
 
 def _solve(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """Where the derivative, monotone on the piece, equals the slope, or is nearest to it: regula falsi, Illinois variant."""
+    """Where the derivative, monotone on the piece, is nearest to the slope: regula falsi, Illinois variant."""
     left, right = start, end
     at_left, at_right = _derivative(left) - slope, _derivative(right) - slope
     beyond, nearest = at_left * at_right > 0, torch.where(at_left.abs() < at_right.abs(), left, right)

@@ -31,9 +31,10 @@ from sagemp_cli.reachability.relaxations.pieces import (
 )
 
 ULPS = 4
-"""Margin, in ulps of 1, allowed to ``torch.sin``, ``torch.cos``, ``torch.acos``, ``torch.asin``; tested against ball arithmetic."""
+"""Margin for ``torch.sin, cos, acos, asin``, in ulps of 1; tested against ball arithmetic."""
 
-_SLACK = 1e-7  # an extremum this far outside (in turns) is counted too: its excess exceeds the end's by at most (2 pi slack)^2 / 2
+# an extremum this far outside (in turns) is counted too: its excess exceeds the end's by at most (2 pi slack)^2 / 2
+_SLACK = 1e-7
 _TWO_PI = 2.0 * math.pi
 _NARROW = 0.05  # rad: below, what an inflection costs (a third-order term) is not worth the time
 _WIDE = 2.5  # rad: above, the slope is searched
@@ -41,7 +42,7 @@ _FAR = 2.0**40  # rad: beyond, rounding of the argument leaves nothing but [-1, 
 
 
 class _Wave(NamedTuple):
-    """Sine or cosine: value, derivative, where the excess has its maximum and minimum at a given slope, one inflection."""
+    """Sine or cosine: value, derivative, maximum and minimum of the excess at a slope, one inflection."""
 
     value: Callable[[Tensor], Tensor]
     derivative: Callable[[Tensor], Tensor]
@@ -147,8 +148,8 @@ def _range(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
 def _margin(size: Tensor) -> Tensor:
     """What an excess as computed may be off by.
 
-    The values by ULPS ulps of 1, ``slope * x`` and the difference by 4 roundings, and the argument of the extrema by a few
-    ulps of x (times ``|slope| <= 1``; the excess is flat there). The rounding of the offset is in it as well.
+    The values by ULPS ulps of 1, ``slope * x`` and the difference by 4 roundings, and the argument of the extrema by
+    a few ulps of x (times ``|slope| <= 1``; the excess is flat there). The rounding of the offset is in it as well.
     """
     return (size + 8.0) * ((16 + 4 * ULPS) * UNIT)
 
@@ -159,7 +160,7 @@ def _chord(wave: _Wave, lower: Tensor, upper: Tensor) -> Tensor:
 
 
 def _shortened(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """The interval, its shorter side of the inflection cut to half the longer one's length (if there is an inflection inside)."""
+    """The interval; if an inflection is inside, its shorter side cut to half the longer one's length."""
     middle = 0.5 * lower + 0.5 * upper
     center = wave.inflection + math.pi * torch.round((middle - wave.inflection) * (1.0 / math.pi))
     left, right = center - lower, upper - center
@@ -170,10 +171,11 @@ def _shortened(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tenso
 
 
 def _extrema(wave: _Wave, slope: Tensor, ends: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The excess at the ends and at the first and last local maximum (and minimum) inside: ``(4, ...)`` each, and the points.
+    """The excess at both ends and the first and last maximum (and minimum) inside, ``(4, ...)`` each; the points.
 
-    Where none is inside, the last two of the four are infinite of the sign that never wins. The place of an extremum and its
-    height are taken as constants by autograd: the derivative of an extreme value with respect to the slope is minus its place.
+    Where none is inside, the last two of the four are infinite of the sign that never wins. The place of an extremum
+    and its height are taken as constants by autograd: the derivative of an extreme value with respect to the slope is
+    minus its place.
     """
     with torch.no_grad():
         base = torch.stack(wave.turns(slope))

@@ -1,7 +1,7 @@
 """Softplus ``log(1 + exp(beta x)) / beta``: convex.
 
-torch returns x itself where ``beta x > threshold``. What is enclosed is both, the smooth function and torch's: up to the jump
-of ``log(1 + exp(-threshold)) / beta`` (2e-9 by default) lower where the interval reaches the threshold.
+torch returns x itself where ``beta x > threshold``. What is enclosed is both, the smooth function and torch's: up to
+the jump of ``log(1 + exp(-threshold)) / beta`` (2e-9 by default) lower where the interval reaches the threshold.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import pieces
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
 
 ULPS = 4
-"""Margin allowed to the formulas below, in ulps of the result; tested against ball arithmetic."""
+"""Margin for the formulas below, in ulps of the result; tested against ball arithmetic."""
 
 
 def _value(z: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ def band(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20.
     slope, offset, radius = pieces.band(CURVE, z_lower, z_upper)
     half = 0.5 * _jump(z_upper, threshold)
     offset, radius = (offset - half) / beta, (radius + half) / beta
-    return Band(slope, offset, radius + (offset.abs() + radius) * (8 * UNIT) + TINY)
+    return settled(slope, offset, radius + (offset.abs() + radius) * (8 * UNIT) + TINY)
 
 
 def lines(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Lines:
@@ -79,4 +79,4 @@ def _scaled(lower: Tensor, upper: Tensor, beta: float) -> tuple[Tensor, Tensor]:
 def _jump(z_upper: Tensor, threshold: float) -> Tensor:
     """How far torch's function may lie below the smooth one."""
     jump = math.log1p(math.exp(-threshold)) * (1 + 1e-12)
-    return torch.where(z_upper * (1 + 8 * UNIT) > threshold, jump, 0.0).to(z_upper)
+    return (z_upper * (1 + 8 * UNIT) > threshold).to(z_upper) * jump

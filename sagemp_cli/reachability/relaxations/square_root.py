@@ -14,9 +14,10 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import outward
 
 ULPS = 2
-"""Margin allowed to ``torch.sqrt`` (correctly rounded) and to the derivative, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.sqrt`` and the derivative below, in ulps of the result; tested against ball arithmetic."""
 
-_SMALLEST = 1e-240  # where the tangent at 0 is vertical, the one used is that at this point; the graph rises above it by 1e-120 at most
+# where the tangent at 0 is vertical, the one used is that at this point; the graph rises above it by 1e-120 at most
+_SMALLEST = 1e-240
 
 
 def _derivative(x: Tensor) -> Tensor:

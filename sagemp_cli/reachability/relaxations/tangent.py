@@ -17,9 +17,10 @@ from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
 
 ULPS = 6
-"""Margin allowed to ``torch.tan`` and to the derivative below, in ulps of the result; tested against ball arithmetic."""
+"""Margin for ``torch.tan`` and the derivative below, in ulps of the result; tested against ball arithmetic."""
 
-_POLE = 1e-12  # distance to a pole, relative to 1 + |x|, below which nothing is claimed: far above the rounding of multiples of pi
+# distance to a pole, relative to 1 + |x|, below which nothing is claimed: far above the rounding of multiples of pi
+_POLE = 1e-12
 _FAR = 1e9  # beyond this many rad, too
 
 

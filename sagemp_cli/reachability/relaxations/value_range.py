@@ -12,7 +12,7 @@ from sagemp_cli.reachability.relaxations.band import TINY, UNIT
 
 
 def outward(least: Tensor, most: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:
-    """Computed extreme values, moved outwards by their relative error (``ulps`` of 2^-52) and underflow; NaN becomes infinite."""
+    """Computed extremes moved outwards by their error (``ulps`` of 2^-52) and underflow; NaN becomes infinite."""
     margin = (2 * ulps + 1) * UNIT
     return (
         torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf),
@@ -20,6 +20,8 @@ def outward(least: Tensor, most: Tensor, *, ulps: float) -> tuple[Tensor, Tensor
     )
 
 
-def increasing(value: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:
+def increasing(
+    value: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, *, ulps: float
+) -> tuple[Tensor, Tensor]:
     """Range of an increasing function."""
     return outward(value(lower), value(upper), ulps=ulps)

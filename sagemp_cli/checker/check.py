@@ -1,0 +1,292 @@
+"""Proving a certificate or a library again, from the file alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sagemp_cli.binding import target_class
+from sagemp_cli.checker.balls import BITS, Unproved, ball, ctx
+from sagemp_cli.checker.cell import CellClaim, Policy, prove_cell
+from sagemp_cli.checker.counterexample import applies, prove_violation
+from sagemp_cli.checker.cover import covered
+from sagemp_cli.checker.document import Document, read_document
+from sagemp_cli.checker.scene import SafeSet
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.errors import ArtifactError, SagempError
+from sagemp_cli.progress import Progress, Silent
+
+_ULP = 2.0**-52
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found about one reference.
+
+    Attributes:
+        reference: its index.
+        claimed: the verdict in the file.
+        proved: whether SAFE is claimed and was proved.
+        reason: why not, in one line; empty if proved.
+        clearance: least proved distance of the stored tube to each constraint, by name (m); empty if not proved.
+        goal_margin: the same to the goal's faces, by state.
+    """
+
+    reference: int
+    claimed: str
+    proved: bool
+    reason: str
+    clearance: Mapping[str, float]
+    goal_margin: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found about a file.
+
+    Attributes:
+        path: the file.
+        kind: ``certificate`` or ``library``.
+        claimed: the verdict in the file (a library claims VERIFIED).
+        answer: VERIFIED if all references are proved, FALSIFIED if a violation is, else UNKNOWN.
+        problems: what is wrong with the claim as a whole, one line each.
+        findings: one for each reference.
+        cells, horizon: how many.
+        seconds, proof_seconds: time of this check, and of the proof according to the file.
+    """
+
+    path: Path
+    kind: str
+    claimed: str
+    answer: str
+    problems: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    cells: int
+    horizon: int
+    seconds: float
+    proof_seconds: float
+
+
+def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -> Report:
+    """Prove what a file claims.
+
+    Args:
+        path: a certificate or a library.
+        processes: workers that share the cells; 1 works here.
+        progress: reports cells.
+
+    Raises:
+        ArtifactError: the file is missing, damaged, changed, of a newer format or not one that can be checked.
+    """
+    began = time.perf_counter()
+    document = read_document(path)
+    try:
+        dynamics = _dynamics(document.config)
+        safe = SafeSet.of(document.config["scene"])
+        with ctx.workprec(BITS):
+            problems = list(_problems(document, dynamics, safe))
+    except (LookupError, TypeError, ValueError, AttributeError, SagempError) as e:
+        raise ArtifactError(f"{path}: /config does not describe a problem ({' '.join(str(e).split())})") from None
+    except Unproved as e:
+        raise ArtifactError(f"{path}: /config: {e}") from None
+    tubes, count = document.tubes, len(document.tubes["references"])
+    with ctx.workprec(BITS):
+        claims = [] if problems else [r for r in range(count) if tubes["verdict"][r] == "SAFE"]
+        reasons, findings = _geometry(document, dynamics, safe, claims)
+        open_ = [r for r in claims if not reasons[r]]
+        for r, reason in _reach_sets(document, dynamics, open_, processes, progress or Silent()):
+            reasons[r] = reasons[r] or reason
+        found = tuple(_finding(r, tubes["verdict"][r], reasons.get(r), findings.get(r)) for r in range(count))
+        falsified = not problems and document.verdict == "FALSIFIED" and _falsified(document, dynamics, safe)
+    verified = bool(found) and not problems and all(f.proved for f in found)
+    return Report(
+        path=path,
+        kind=document.kind,
+        claimed=document.verdict or "VERIFIED",
+        answer="VERIFIED" if verified else "FALSIFIED" if falsified else "UNKNOWN",
+        problems=tuple(problems),
+        findings=found,
+        cells=len(tubes["cell_reference"]),
+        horizon=tubes["references"].shape[1] - 1,
+        seconds=time.perf_counter() - began,
+        proof_seconds=float(np.sum(tubes["seconds"])),
+    )
+
+
+def _dynamics(config: Mapping[str, Any]) -> Dynamics:
+    section = config["dynamics"]
+    model = target_class(section, "dynamics")  # from an allow-list of this package's own classes
+    if not issubclass(model, Dynamics):
+        raise TypeError(f"dynamics: {model.__name__} is not a robot model")
+    return model(**{key: value for key, value in section.items() if key != "_target_"}).double().eval()
+
+
+def _problems(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator[str]:
+    """What is wrong with the claim as a whole: sizes, W, X_I, finite numbers, and the verdict of all."""
+    tubes, config, n = document.tubes, document.config, dynamics.state_dim
+    sizes = (tubes["references"].shape[2], tubes["control_lower"].shape[2], tubes["references"].shape[1] - 1)
+    wanted = (n, dynamics.control_dim, config["horizon"])
+    if sizes != wanted or (len(document.policy.error_scale), len(document.policy.control_scale)) != wanted[:2]:
+        yield f"the file has {sizes} states, controls and steps, its config {wanted}"
+        return
+    flat = len(dynamics.position)
+    shapes = [len(v) for o in safe.obstacles for v in o[2:] if isinstance(v, list)] + [len(v) for v in safe.workspace]
+    if any(s != flat for s in shapes) or any(len(v) != n for v in safe.goal):
+        yield "the scene does not have the dimensions of the robot's positions and states"
+        return
+    for name in ("references", "start_lower", "start_upper", "cell_lower", "cell_upper"):
+        if not np.isfinite(tubes[name]).all():
+            yield f"{name} holds a number that is not finite"
+    try:
+        start, w = config["start"], config["disturbance"]["radius"]
+        boxes = [
+            ("W", tubes["disturbance_lower"], tubes["disturbance_upper"], [0.0] * n, w),
+            *(("X_I", a, b, start["center"], start["radius"])
+              for a, b in zip(tubes["start_lower"], tubes["start_upper"], strict=True)),
+        ]  # fmt: skip
+        for name, lower, upper, center, radius in boxes:
+            if not _contains(lower, upper, center, radius):
+                yield f"{name} of the file does not contain that of its config"
+                break
+    except Unproved as e:
+        yield str(e)
+    if tuple(tubes["constraint_names"]) != safe.names:
+        yield f"the constraints are {', '.join(safe.names)}, the file names {', '.join(tubes['constraint_names'])}"
+    follows = _answer(tubes["verdict"])
+    if document.kind == "certificate" and document.verdict != follows:
+        yield f"the verdict is {document.verdict}, but {follows} follows from those of the references"
+    if not document.operations and "SAFE" in tubes["verdict"]:
+        yield (
+            f"the tubes were made by propagator '{document.propagator}', which records no relaxations: "
+            f"they cannot be checked"
+        )
+
+
+def _answer(verdicts: Sequence[str]) -> str:
+    if "UNSAFE" in verdicts:
+        return "FALSIFIED"
+    return "VERIFIED" if verdicts and all(v == "SAFE" for v in verdicts) else "UNKNOWN"
+
+
+def _contains(lower: np.ndarray, upper: np.ndarray, center: Sequence[Any], radius: Sequence[Any]) -> bool:
+    """Whether a stored box contains ``center +- radius``, exactly."""
+    if not len(lower) == len(center) == len(radius):
+        return False
+    sides = zip(lower, upper, center, radius, strict=True)
+    return all(ball(a) <= ball(c) - ball(r) and ball(c) + ball(r) <= ball(b) and ball(r) >= 0 for a, b, c, r in sides)
+
+
+def _geometry(
+    document: Document, dynamics: Dynamics, safe: SafeSet, claims: Sequence[int]
+) -> tuple[dict[int, str], dict[int, tuple[dict[str, float], dict[str, float]]]]:
+    """Of each reference claimed SAFE what does not hold of cells, scene and figures, and the margins proved."""
+    tubes, index = document.tubes, list(dynamics.position)
+    reasons, margins = {}, {}
+    for r in claims:
+        own = tubes["cell_reference"] == r
+        lower, upper = tubes["tube_lower"][own], tubes["tube_upper"][own]
+        try:
+            start = tubes["start_lower"][r], tubes["start_upper"][r]
+            if not covered(*start, tubes["cell_lower"][own], tubes["cell_upper"][own]):
+                raise Unproved("its cells do not cover X_I")
+            if not (np.isfinite(lower) & np.isfinite(upper) & (lower <= upper)).all():
+                raise Unproved("its tube is not finite")
+            if tubes["step"][r] != -1 or tubes["constraint"][r] != "":
+                raise Unproved("it is called SAFE, but a step or constraint that decided is named")
+            distances = safe.clearances(*(side[..., index].reshape(-1, len(index)) for side in (lower, upper)))
+            for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
+                if not distance > 0:
+                    raise Unproved(f"its tube is not clear of '{name}'")
+                if distance.is_finite() and not ball(stored) <= distance:
+                    raise Unproved(f"the clearance to '{name}' is {float(distance):.9g}, the file says {stored:.9g}")
+            goal = safe.goal_margins(lower[:, -1].min(axis=0), upper[:, -1].max(axis=0))
+            for name, margin, stored in zip(dynamics.state_names, goal, tubes["goal_margin"][r], strict=True):
+                if margin is None:
+                    continue
+                if not margin >= 0:
+                    raise Unproved(f"its tube does not end in the goal ({name})")
+                if not ball(stored) <= margin * (1 + ball(2 * _ULP)):  # stored rounded to nearest
+                    raise Unproved(f"the goal margin of {name} is {float(margin):.9g}, the file says {stored:.9g}")
+            reasons[r] = ""
+            margins[r] = (
+                {name: float(d) for name, d in zip(safe.names, distances, strict=True)},
+                {name: float(g) for name, g in zip(dynamics.state_names, goal, strict=True) if g is not None},
+            )
+        except Unproved as e:
+            reasons[r] = str(e)
+    return reasons, margins
+
+
+def _reach_sets(
+    document: Document, dynamics: Dynamics, claims: Sequence[int], processes: int, progress: Progress
+) -> Iterator[tuple[int, str]]:
+    """Reference and reason, empty if proved, for each of their cells."""
+    owner = document.tubes["cell_reference"]
+    cells = np.flatnonzero(np.isin(owner, claims)).tolist()
+    jobs = ((_claim(document, c), document.config["dynamics"], document.policy) for c in cells)
+    with progress.task("checking cells", len(cells)) as task:
+        if processes <= 1 or len(cells) < 2:
+            answers = (prove_cell(claim, dynamics, policy) for claim, _, policy in jobs)
+            for c, reason in zip(cells, answers, strict=True):
+                task.advance(1)
+                yield int(owner[c]), reason and f"cell {c}, {reason}"
+            return
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(processes, len(cells)), mp_context=context) as pool:
+            for c, reason in zip(cells, pool.map(_prove_elsewhere, *zip(*jobs, strict=True)), strict=True):
+                task.advance(1)
+                yield int(owner[c]), reason and f"cell {c}, {reason}"
+
+
+def _prove_elsewhere(claim: CellClaim, section: Mapping[str, Any], policy: Policy) -> str:
+    torch.set_num_threads(1)
+    return prove_cell(claim, _dynamics({"dynamics": section}), policy)
+
+
+def _claim(document: Document, c: int) -> CellClaim:
+    tubes, found = document.tubes, document.relaxations
+    r = tubes["cell_reference"][c]
+    return CellClaim(
+        reference=tubes["references"][r],
+        lower=tubes["cell_lower"][c],
+        upper=tubes["cell_upper"][c],
+        tube_lower=tubes["tube_lower"][c],
+        tube_upper=tubes["tube_upper"][c],
+        control_lower=tubes["control_lower"][r],
+        control_upper=tubes["control_upper"][r],
+        disturbance_lower=tubes["disturbance_lower"],
+        disturbance_upper=tubes["disturbance_upper"],
+        operations=document.operations,
+        slope=found["slope"][c],
+        offset=found["offset"][c],
+        radius=found["radius"][c],
+        kept=found["kept"][c] if "kept" in found else None,
+    )
+
+
+def _finding(
+    r: int, claimed: str, reason: str | None, margins: tuple[dict[str, float], dict[str, float]] | None
+) -> Finding:
+    if reason is None:
+        reason = "the file does not claim that it is safe" if claimed != "SAFE" else "see the problems of the file"
+    clearance, goal = margins if margins is not None and not reason else ({}, {})
+    return Finding(r, claimed, not reason, reason, clearance, goal)
+
+
+def _falsified(document: Document, dynamics: Dynamics, safe: SafeSet) -> bool:
+    """Whether every reference that the file calls UNSAFE has a counterexample whose violation is proved."""
+    refuted = {
+        int(e["reference"])
+        for e in document.counterexamples
+        if applies(e, document.tubes)
+        and not prove_violation(e, document.tubes, dynamics=dynamics, policy=document.policy, safe=safe)
+    }
+    return refuted >= {r for r, v in enumerate(document.tubes["verdict"]) if v == "UNSAFE"}

@@ -1,0 +1,201 @@
+"""Reading a certificate or a library with h5py alone: the file is untrusted input, and everything in it is checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+
+from sagemp_cli.checker.cell import Policy
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.storage.content import ContentError, content_hash
+
+KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
+"""Schemas that can be checked, with the newest version of their format that is known here."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """A file's content; shapes as in ``docs/certificates.md``.
+
+    Attributes:
+        kind: ``certificate`` or ``library``.
+        config: the resolved config.
+        tubes: datasets of ``/data/tubes`` by name, texts as lists of str.
+        propagator, rigorous: what made the tubes.
+        operations: names and numbers of entries of the recorded relaxations; empty if none are recorded.
+        relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``.
+        policy: the tracker.
+        verdict: of a certificate; empty for a library.
+        counterexamples: attributes and datasets of each.
+    """
+
+    kind: str
+    config: Mapping[str, Any]
+    tubes: Mapping[str, Any]
+    propagator: str
+    rigorous: bool
+    operations: tuple[tuple[str, int], ...]
+    relaxations: Mapping[str, np.ndarray]
+    policy: Policy
+    verdict: str
+    counterexamples: tuple[Mapping[str, Any], ...]
+
+
+def read_document(path: Path) -> Document:
+    """Read and check a file.
+
+    Raises:
+        ArtifactError: missing, not HDF5, of another kind, of a newer format, changed since it was written, or with
+            anything missing or of the wrong type or shape.
+    """
+    if not path.is_file():
+        raise ArtifactError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            return _read(file, path)
+    except ArtifactError:
+        raise
+    except ContentError as e:
+        raise ArtifactError(f"{path}: {e}") from None
+    except (
+        OSError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        MemoryError,
+        RecursionError,
+        yaml.YAMLError,
+    ) as e:
+        raise ArtifactError(f"{path}: not a certificate, or a damaged one ({' '.join(str(e).split())})") from None
+
+
+def _read(file: h5py.File, path: Path) -> Document:
+    schema = str(file.attrs.get("schema", ""))
+    if schema not in KINDS:
+        raise ArtifactError(f"{path}: is '{schema or 'no artifact'}'; only {' and '.join(KINDS)} can be checked")
+    version = int(file.attrs["schema_version"])
+    if version > KINDS[schema]:
+        raise ArtifactError(
+            f"{path}: format {version} of '{schema}' is newer than this checker knows (up to {KINDS[schema]})"
+        )
+    stored = str(file.attrs.get("content_sha256", ""))
+    if not stored:
+        raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
+    if content_hash(file) != stored:
+        raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
+    config = yaml.safe_load(file["config"].asstr()[()])
+    data, tubes = file["data"], file["data/tubes"]
+    read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], h5py.Dataset)}
+    _require_shapes(read, path)
+    relaxations, operations = {}, ()
+    if "relaxations" in tubes:
+        group = tubes["relaxations"]
+        relaxations = {name: _dataset(group[name]) for name in group}
+        operations = tuple(zip(relaxations["operations"], map(int, relaxations["widths"]), strict=True))
+        _require_relaxations(relaxations, operations, read, path)
+    weights = {name: _dataset(d) for name, d in data["tracker"].items()}
+    examples = data.get("counterexamples", {})
+    return Document(
+        kind=schema.removeprefix("sagemp/"),
+        config=config,
+        tubes=read,
+        propagator=str(tubes.attrs["propagator"]),
+        rigorous=bool(tubes.attrs["rigorous"]),
+        operations=operations,
+        relaxations=relaxations,
+        policy=_policy(weights, json.loads(data.attrs["tracker_arguments"])),
+        verdict=str(data.attrs.get("verdict", "")),
+        counterexamples=tuple(
+            {**examples[name].attrs, **{key: _dataset(d) for key, d in examples[name].items()}} for name in examples
+        ),
+    )
+
+
+def _dataset(dataset: h5py.Dataset) -> Any:
+    if h5py.check_string_dtype(dataset.dtype) is not None:
+        return [str(v) for v in dataset.asstr()[()]]
+    return np.asarray(dataset[()])
+
+
+_SHAPES = {
+    "references": "R K+1 n",
+    "start_lower": "R n",
+    "start_upper": "R n",
+    "disturbance_lower": "n",
+    "disturbance_upper": "n",
+    "cell_reference": "C",
+    "cell_lower": "C n",
+    "cell_upper": "C n",
+    "tube_lower": "C K+1 n",
+    "tube_upper": "C K+1 n",
+    "control_lower": "R K m",
+    "control_upper": "R K m",
+    "clearance": "R constraints",
+    "goal_margin": "R n",
+    "step": "R",
+}
+_TEXTS = {"verdict": "R", "constraint": "R", "constraint_names": "constraints"}
+
+
+def _require_shapes(tubes: Mapping[str, Any], path: Path) -> None:
+    count, rows, n = tubes["references"].shape
+    sizes = {"R": count, "K+1": rows, "K": rows - 1, "n": n, "C": len(tubes["cell_reference"])}
+    sizes |= {"m": tubes["control_lower"].shape[-1], "constraints": len(tubes["constraint_names"])}
+    for name, dims in {**_SHAPES, **_TEXTS}.items():
+        value, wanted = tubes[name], tuple(sizes[d] for d in dims.split())
+        shape = (len(value),) if name in _TEXTS else value.shape
+        integer = name in ("cell_reference", "step")
+        kind = str if name in _TEXTS else np.int64 if integer else np.float64
+        right = all(isinstance(v, str) for v in value) if name in _TEXTS else value.dtype == kind
+        if shape != wanted or not right:
+            raise ArtifactError(f"{path}: /data/tubes/{name} must be {kind.__name__} of shape {wanted}")
+    if rows < 2 or not np.isin(tubes["cell_reference"], np.arange(count)).all():
+        raise ArtifactError(f"{path}: /data/tubes needs at least one step, and cells of its own references")
+
+
+def _require_relaxations(
+    found: Mapping[str, Any], operations: tuple[tuple[str, int], ...], tubes: Mapping[str, Any], path: Path
+) -> None:
+    cells, rows, _ = tubes["tube_lower"].shape
+    wanted = (cells, rows - 1, sum(width for _, width in operations))
+    for name in ("slope", "offset", "radius"):
+        if found[name].shape != wanted or found[name].dtype != np.float64 or any(w < 1 for _, w in operations):
+            raise ArtifactError(f"{path}: /data/tubes/relaxations/{name} must be float64 of shape {wanted}")
+    kept = found.get("kept")
+    if kept is not None and (kept.shape[:2] != wanted[:2] or kept.ndim != 3 or kept.dtype != np.uint8):
+        raise ArtifactError(f"{path}: /data/tubes/relaxations/kept must be uint8 of shape {(*wanted[:2], 'bytes')}")
+
+
+def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> Policy:
+    """The tracker; ``negative_slope`` and ``lookahead`` are all that is taken from its constructor's arguments."""
+    depth = sum(name.endswith(".weight") for name in weights)
+    layers = [(weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"]) for i in range(depth)]
+    scales = [weights[name] for name in ("error_scale", "control_scale", "control_offset")]
+    for array in [a for pair in layers for a in pair] + scales:
+        if array.dtype != np.float64 or not np.isfinite(array).all():
+            raise ValueError("tracker weights must be finite float64 numbers")
+    lookahead, n, m = int(arguments["lookahead"]), len(scales[0]), len(scales[1])
+    widths = [lookahead * n, *(len(b) for _, b in layers)]
+    fits = all(w.shape == (b, a) for (w, _), a, b in zip(layers, widths[:-1], widths[1:], strict=True))
+    fits &= widths[-1] == m == len(scales[2]) and len(weights) == 2 * depth + 3
+    if depth < 2 or lookahead < 1 or not fits:
+        raise ValueError("tracker weights do not fit each other")
+    return Policy(
+        weights=tuple(w for w, _ in layers),
+        biases=tuple(b for _, b in layers),
+        error_scale=scales[0],
+        control_scale=scales[1],
+        control_offset=scales[2],
+        negative_slope=float(arguments["negative_slope"]),
+        lookahead=lookahead,
+    )

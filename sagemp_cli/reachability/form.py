@@ -1,0 +1,154 @@
+"""What all value types have in common that stand for a set and answer torch's operations.
+
+A propagator evaluates ``loop.step`` once on such values. A type brings its own linear operations (``handlers``) and one method,
+:meth:`Form.relaxed`, for what is not linear; the nonlinear functions themselves are written once for all types, in
+:mod:`sagemp_cli.reachability.relaxed_operations`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.relaxations.lines import Lines
+
+Handler = Callable[..., Any]
+
+
+class Operation(NamedTuple):
+    """The relaxations of one scalar function; every one takes the ends of the interval and the function's parameters.
+
+    Attributes:
+        band: around one line.
+        lines: one below and one above.
+        value_range: of the values.
+    """
+
+    band: Callable[..., Band]
+    lines: Callable[..., Lines]
+    value_range: Callable[..., tuple[Tensor, Tensor]]
+
+
+class Form:
+    """A set of values of one shape. Final types have ``shape`` and ``dim()`` as tensors do, batch first."""
+
+    __slots__ = ()
+
+    handlers: ClassVar[dict[Any, Handler]]
+    """Torch function to its implementation on this type; it goes before :data:`SHARED`."""
+
+    def relaxed(self, name: str, operation: Operation, *parameters: Any) -> Form:
+        """What encloses ``f(self)``, entry by entry."""
+        raise NotImplementedError
+
+    def widened(self, name: str, band: Band) -> Form:
+        """What encloses ``slope * self + offset + [-radius, radius]``."""
+        raise NotImplementedError
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bound of every entry."""
+        raise NotImplementedError
+
+    def _call(self, function: Any, *args: Any) -> Any:
+        return self.handlers[function](*args)
+
+    def __add__(self, other: Any) -> Any:
+        return self._call(torch.add, self, other)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Any:
+        return self._call(torch.neg, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._call(torch.add, self, -other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._call(torch.add, -self, other)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._call(torch.mul, self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Any:
+        return torch.div(self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return torch.div(other, self)
+
+    def __pow__(self, exponent: Any) -> Any:
+        return torch.pow(self, exponent)
+
+    def __rpow__(self, base: Any) -> Any:
+        return torch.pow(base, self)
+
+    def __abs__(self) -> Any:
+        return torch.abs(self)
+
+    def __matmul__(self, other: Any) -> Any:
+        return torch.matmul(self, other)
+
+    def __bool__(self) -> bool:
+        raise UnsupportedOperationError(
+            "a step may not branch on a value: the truth of a set is not one of True and False; "
+            "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+        )
+
+    def _compare(self, other: Any) -> bool:
+        return self.__bool__()
+
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
+    __hash__ = object.__hash__
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(torch.Tensor, name, None)
+        if method is None or name.startswith("__"):
+            raise AttributeError(name)
+        if not callable(method):
+            raise unsupported(name)
+        return lambda *args, **kwargs: type(self)._dispatch(method, (self, *args), kwargs)
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Callable[..., Any], types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        return cls._dispatch(function, args, kwargs or {})
+
+    @classmethod
+    def _dispatch(cls, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        handler = cls.handlers.get(function) or SHARED.get(function)
+        if handler is None:
+            raise unsupported(getattr(function, "__name__", str(function)))
+        return handler(*args, **kwargs)
+
+
+SHARED: dict[Any, Handler] = {}
+"""Torch function to what it does on every type; one line per function."""
+
+
+def registers(table: dict[Any, Handler]) -> Callable[..., Callable[[Handler], Handler]]:
+    """A decorator ``@...(functions)`` that enters an implementation into a table of handlers."""
+
+    def handles(*functions: Any) -> Callable[[Handler], Handler]:
+        def register(implementation: Handler) -> Handler:
+            for f in functions:
+                table[f] = implementation
+            return implementation
+
+        return register
+
+    return handles
+
+
+def unsupported(name: str) -> UnsupportedOperationError:
+    """The error for a torch operation that nothing is known of."""
+    return UnsupportedOperationError(
+        f"torch operation '{name}' has no relaxation in the native propagators (affine, crown, interval); "
+        f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
+    )

@@ -1,0 +1,119 @@
+import dataclasses
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from sagemp_cli.errors import ResourceError
+from sagemp_cli.report.canvas import Setting, blank_figure, shown_steps
+from sagemp_cli.report.certificate import draw_certificate
+from sagemp_cli.report.figure import save_figure
+from sagemp_cli.report.reproduce import draw_experiment, main
+from sagemp_cli.storage import Certificate, Counterexample, read_artifact
+
+
+def texts(figure):
+    """Every text that the figure itself carries: headline and subtitle."""
+    return [t.get_text() for t in figure.texts]
+
+
+@pytest.fixture
+def certificate(toy_folder):
+    return read_artifact(toy_folder / "certificate.h5", Certificate)
+
+
+def test_all_figures_of_an_experiment_are_made_from_its_artifacts_alone(toy_root, toy_folder, tmp_path, capsys):
+    root = tmp_path / "artifacts"
+    shutil.copytree(toy_folder, root / "toy", ignore=shutil.ignore_patterns("*.png", "planner.h5"))
+    before = {p.name: p.read_bytes() for p in (root / "toy").iterdir()}
+    assert main([str(root)]) == 0
+    names = ["demonstrations", "tracker", "certificate", "library", "rollouts"]  # the planner was not run here
+    paths = [root / "figures" / f"toy_{name}.png" for name in names]
+    assert capsys.readouterr().out.split() == [str(p) for p in paths]
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths)
+    assert {p.name: p.read_bytes() for p in (root / "toy").iterdir()} == before
+
+
+def test_no_artifacts_is_one_line_and_a_usage_error(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert (
+        capsys.readouterr().err == f"error: {tmp_path}: holds no experiment's artifacts; make some with 'sagemp run'\n"
+    )
+
+
+def test_an_empty_folder_gives_no_figure(tmp_path):
+    assert draw_experiment(tmp_path, tmp_path) == []
+
+
+def test_a_damaged_artifact_is_an_error_not_a_figure(tmp_path, capsys):
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "certificate.h5").write_bytes(b"no HDF5")
+    assert main([str(tmp_path)]) == 2
+    assert "certificate.h5: not a readable HDF5 file" in capsys.readouterr().err
+
+
+def test_the_title_states_verdict_cells_horizon_and_time(certificate):
+    title, subtitle = texts(draw_certificate(certificate))
+    assert title.startswith("Certified")
+    for part in ("SAFE, passes disc at", "4 cells", "K = 25 (2.5 s)", "affine in", "rounding included"):
+        assert part in subtitle
+
+
+def changed(certificate, **tubes):
+    record = certificate.record
+    return dataclasses.replace(
+        certificate, record=dataclasses.replace(record, tubes=dataclasses.replace(record.tubes, **tubes))
+    )
+
+
+def test_a_tube_that_overflows_is_drawn_up_to_there(certificate, tmp_path):
+    tubes = certificate.record.tubes
+    lower, upper = tubes.tube_lower.copy(), tubes.tube_upper.copy()
+    lower[:, 10:], upper[:, 10:] = -1e200, 1e200
+    lower[:, 12:], upper[:, 12:] = -math.inf, math.inf
+    lower[0, 20:] = upper[0, 20:] = math.nan
+    odd = changed(
+        certificate,
+        tube_lower=lower,
+        tube_upper=upper,
+        verdict=("UNBOUNDED",),
+        step=np.array([12]),
+        constraint=("px",),
+        clearance=np.full_like(tubes.clearance, -math.inf),
+    )
+    assert shown_steps(Setting.of(certificate.header.config), lower, upper) == 10
+    odd = dataclasses.replace(odd, record=dataclasses.replace(odd.record, verdict="UNKNOWN"))
+    figure = draw_certificate(odd)
+    save_figure(figure, tmp_path / "odd.png")
+    title, subtitle = texts(figure)
+    assert title.startswith("Unknown")
+    assert "UNBOUNDED at step 12 (px)" in subtitle
+
+
+def test_a_counterexample_is_drawn(certificate, tmp_path):
+    example = Counterexample(
+        reference=0,
+        kind="collision",
+        step=9,
+        constraint="disc",
+        depth=0.1,
+        states=certificate.record.tubes.references[0],
+        disturbances=np.zeros((25, 4)),
+    )
+    bad = changed(certificate, verdict=("UNSAFE",), step=np.array([9]), constraint=("disc",))
+    bad = dataclasses.replace(
+        bad, record=dataclasses.replace(bad.record, verdict="FALSIFIED", counterexamples=(example,))
+    )
+    figure = draw_certificate(bad)
+    save_figure(figure, tmp_path / "bad.png")
+    assert texts(figure)[0].startswith("Falsified")
+    labels = [t.get_text() for axes in figure.axes if axes.get_legend() for t in axes.get_legend().get_texts()]
+    assert "counterexample" in labels
+
+
+def test_a_figure_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ResourceError, match="file/figure.png: cannot be written"):
+        save_figure(blank_figure(2, 2), tmp_path / "file" / "figure.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]

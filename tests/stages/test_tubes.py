@@ -1,0 +1,34 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.stages.tubes import tubes_record, verification_of
+from sagemp_cli.storage import Library, read_artifact
+
+from .conftest import assert_same
+
+
+@pytest.fixture
+def tubes(toy_folder):
+    return read_artifact(toy_folder / "library.h5", Library).record.tubes
+
+
+def test_tubes_come_back_from_the_record_as_they_went(tubes):
+    again = tubes_record(verification_of(tubes, "library.h5"))
+    assert_same(again, tubes)
+    np.testing.assert_array_equal(again.seconds, tubes.seconds)
+
+
+def test_cells_that_belong_to_no_reference_are_refused(tubes):
+    owner = tubes.cell_reference.copy()
+    owner[0] = 1
+    with pytest.raises(ArtifactError, match="library.h5: /data/tubes/cell_reference must list equally many cells"):
+        verification_of(dataclasses.replace(tubes, cell_reference=owner), "library.h5")
+
+
+def test_an_unknown_verdict_is_refused(tubes):
+    odd = dataclasses.replace(tubes, verdict=("FINE", "SAFE"))
+    with pytest.raises(ArtifactError, match="library.h5: /data/tubes/verdict holds 'FINE'; known: SAFE, MAY_COLLIDE"):
+        verification_of(odd, "library.h5")
