@@ -68,7 +68,7 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
     """Prove that every real-arithmetic rollout from the cell under every disturbance in W^K stays in the stored tube,
     with every control within its stored bounds; the answer is empty, or says in one line what could not be proved.
     """
-    with ctx.workprec(BITS):
+    with ctx.workprec(BITS), np.errstate(all="ignore"):  # what overflows is found out by Zonotope
         k = 0
         try:
             loop = Loop(dynamics, policy, claim.reference)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -23,8 +21,27 @@ class PlanarQuadrotor(Dynamics):
     control_units = ("N", "N m")
     position = (0, 1)
 
-    def __init__(self, *, mass: float = 0.5, gravity: float = -9.81, inertia: float = 0.01, **limits: Any) -> None:
-        super().__init__(**limits)
+    def __init__(
+        self,
+        *,
+        dt: float,
+        control_lower: list[float],
+        control_upper: list[float],
+        state_lower: list[float],
+        state_upper: list[float],
+        disturbance: str = "derivative",
+        mass: float = 0.5,
+        gravity: float = -9.81,
+        inertia: float = 0.01,
+    ) -> None:
+        super().__init__(
+            dt=dt,
+            control_lower=control_lower,
+            control_upper=control_upper,
+            state_lower=state_lower,
+            state_upper=state_upper,
+            disturbance=disturbance,
+        )
         self.mass, self.gravity, self.inertia = float(mass), float(gravity), float(inertia)
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:

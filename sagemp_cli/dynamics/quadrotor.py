@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,12 +28,24 @@ class Quadrotor(Dynamics):
     def __init__(
         self,
         *,
+        dt: float,
+        control_lower: list[float],
+        control_upper: list[float],
+        state_lower: list[float],
+        state_upper: list[float],
+        disturbance: str = "derivative",
         mass: float = 1.0,
         gravity: float = -9.81,
         inertia: Sequence[float] = (0.5, 0.1, 0.3),
-        **limits: Any,
     ) -> None:
-        super().__init__(**limits)
+        super().__init__(
+            dt=dt,
+            control_lower=control_lower,
+            control_upper=control_upper,
+            state_lower=state_lower,
+            state_upper=state_upper,
+            disturbance=disturbance,
+        )
         if len(inertia) != 3:
             raise ConfigError(f"Quadrotor: inertia needs 3 numbers, found {len(inertia)}")
         self.mass, self.gravity = float(mass), float(gravity)

@@ -43,6 +43,7 @@ class Relaxed(NamedTuple):
         center, coefficients, magnitude, error: the input's form.
         lower, upper: the input's bounds that the band was made for (None for a product, which has a band of its own).
         operation, parameters: how to get lines for those bounds; None for a product and where there is nothing but the band.
+        factors: of a product.
     """
 
     name: str
@@ -57,6 +58,27 @@ class Relaxed(NamedTuple):
     upper: Tensor | None = None
     operation: Operation | None = None
     parameters: tuple[Any, ...] = ()
+    factors: Factors | None = None
+
+
+class Factors(NamedTuple):
+    """The deviations X and Y of a product's factors, as ``P = l X + Y / l`` and ``M = l X - Y / l``: ``X Y = (P^2 - M^2) / 4``.
+
+    Attributes:
+        sum, difference: coefficients of P and M, ``(variables, *batch, ...)``.
+        plus, minus: bounds of ``|P|`` and ``|M|``, rounding included.
+        size: bound of ``|l X|`` and ``|Y / l|``, rounding included.
+        middle: what the product's form counts of ``X Y`` itself; the rest is its error.
+        magnitude: of ``l X`` and ``Y / l`` together.
+    """
+
+    sum: Tensor
+    difference: Tensor
+    plus: Tensor
+    minus: Tensor
+    size: Tensor
+    middle: Tensor
+    magnitude: Tensor
 
 
 Hints = Sequence[tuple[Tensor, Tensor] | None]
@@ -384,7 +406,8 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     slack_x, slack_y = mx * share, my * share
     with torch.no_grad():
         radius_x = rows_x.abs().sum(-1).reshape(shape) + slack_x
-        ratio = torch.sqrt((rows_y.abs().sum(-1).reshape(shape) + slack_y) / radius_x)
+        radius_y = rows_y.abs().sum(-1).reshape(shape) + slack_y
+        ratio = torch.sqrt(radius_y / radius_x)
     scale = ratio.reshape(rows_x.shape[:-1])[..., None]
     scaled_x, scaled_y = rows_x * scale, rows_y / scale
     slack = (slack_x * ratio + slack_y / ratio) * _SAFETY
@@ -395,9 +418,20 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     larger, other = c.abs() * my, d.abs() * mx
     magnitude = larger + other + half + TINY  # |c| my >= |c d|, and half >= |middle|
     radius = half * _SAFETY + magnitude * ((2 * error + 16 * UNIT) * _SAFETY)
-    form = AffineForm(frame, c * d + middle, c * gy + d * gx, magnitude, error)
     band = Band(ratio, middle, half)
-    frame.relaxations.append(Relaxed("product", band, radius, frame.size, form.center, form.coefficients, magnitude, error))
+    factors = Factors(
+        gx * ratio + gy / ratio,
+        gx * ratio - gy / ratio,
+        plus,
+        minus,
+        torch.maximum(radius_x * ratio, radius_y / ratio) * _SAFETY,
+        middle,
+        mx * ratio + my / ratio,
+    )
+    frame.relaxations.append(
+        Relaxed("product", band, radius, frame.size, c * d + middle, c * gy + d * gx, magnitude, error, factors=factors)
+    )
+    form = AffineForm(frame, c * d + middle, c * gy + d * gx, magnitude, error)
     return form._with_fresh(form.center, form.coefficients, magnitude, radius)
 
 

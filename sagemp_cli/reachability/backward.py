@@ -27,11 +27,34 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine_form import AffineForm, Relaxed
+from sagemp_cli.reachability.affine_form import AffineForm, Relaxed, StepFrame
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT
 
 _SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and error factors themselves
 _LEAD = 2  # columns before the coefficients: what is gained, and the magnitude
+
+
+class Product(NamedTuple):
+    """Planes over a product's factors, see :func:`_tilted`. Upper bounds first, then lower ones, ``(*batch, 1, 2E)``.
+
+    Attributes:
+        tilts: what a plane may be tilted along, the difference M and the sum P, as coefficients ``(*batch, 2E, first)``.
+        top: the plane's height when it is not tilted.
+        free: the tilts up to ``free / 2`` cost only their square.
+        size: the largest tilt.
+        offset: from the product to its error as the forward pass counts it, rounding included.
+        middle: size of that without rounding.
+        magnitude, rounding: of the tilting variable, and what of it is rounding error.
+    """
+
+    tilts: Tensor
+    top: Tensor
+    free: Tensor
+    size: Tensor
+    offset: Tensor
+    middle: Tensor
+    magnitude: Tensor
+    rounding: Tensor
 
 
 class Replacement(NamedTuple):
@@ -43,6 +66,7 @@ class Replacement(NamedTuple):
         lines: from positive and negative parts of their coefficients to gain, magnitude and earlier coefficients,
             ``(*batch, 2E, 2 + first)``.
         input: the operation's input (and minus it) as such rows, ``(*batch, 2E, 2 + first)``; None for a product.
+        product: planes instead of lines.
     """
 
     first: int
@@ -50,6 +74,7 @@ class Replacement(NamedTuple):
     inverse: Tensor
     lines: Tensor
     input: Tensor | None
+    product: Product | None = None
 
 
 class Step(NamedTuple):
@@ -58,11 +83,15 @@ class Step(NamedTuple):
     Attributes:
         output: the next state's deviation from its centre in terms of all variables, ``(*batch, 2n, 2 + variables)``.
         replacements: in the order of evaluation; the disturbance is the first.
+        shape: the ellipsoid that stands for the state set where a guess is enough, ``(*batch, n, n)``.
+        own: radii of the other variables.
         rounding: relative rounding error of the step's sums.
     """
 
     output: Tensor
     replacements: tuple[Replacement, ...]
+    shape: Tensor
+    own: Tensor
     rounding: float
 
 
@@ -88,7 +117,7 @@ def compiled(steps: Sequence[AffineForm]) -> list[Step]:
 
 
 def backward(
-    steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False
+    steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False, tilted: bool = True
 ) -> Bounds:
     """Bounds of the states after the target steps (and of all operations' inputs in these steps) over the start box.
 
@@ -99,6 +128,7 @@ def backward(
         radius: of the start box, ``(*batch, n)``.
         targets: the steps whose results are bounded.
         inputs: whether the operations' inputs are bounded too.
+        tilted: whether planes over a product's factors are tilted for each row, or level as in affine arithmetic.
     """
     n = radius.shape[-1]
     rows = radius.new_zeros(*radius.shape[:-1], 0, 1 + n)
@@ -115,7 +145,11 @@ def backward(
         for i in range(len(step.replacements) - 1, -1, -1):
             r = step.replacements[i]
             parts = _split(values[..., _LEAD + r.first : _LEAD + r.last] * r.inverse)
-            values = values[..., : _LEAD + r.first] + parts @ r.lines
+            values = values[..., : _LEAD + r.first]
+            if tilted and r.product is not None:
+                values = values + _tilted(parts, r.product, _likely(values[..., _LEAD:], step))
+            else:
+                values = values + parts @ r.lines
             if inputs and k in targets and r.input is not None:
                 values = torch.cat([values, r.input], dim=-2)
                 constant = torch.cat([constant, constant.new_zeros(*r.input.shape[:-1], 1)], dim=-2)
@@ -134,6 +168,37 @@ def backward(
 def _split(rows: Tensor) -> Tensor:
     """Positive and negative parts side by side, both not negative."""
     return torch.cat([rows.clamp(min=0.0), (-rows).clamp(min=0.0)], dim=-1)
+
+
+def _likely(rows: Tensor, step: Step) -> Tensor:
+    """About where in the step's variables the rows are largest; a guess: the state set is taken for an ellipsoid."""
+    n = step.shape.shape[-1]
+    state, own = rows[..., :n], rows[..., n:]
+    ahead = state @ step.shape
+    length = (ahead * state).sum(-1, keepdim=True).sqrt() + TINY
+    return torch.cat([ahead / length, torch.sign(own) * step.own[..., : own.shape[-1]]], dim=-1)
+
+
+def _tilted(parts: Tensor, product: Product, likely: Tensor) -> Tensor:
+    """What replaces the error of a product ``X Y``: a plane, tilted so that it is low where the row is large.
+
+    ``X Y = (P^2 - M^2) / 4`` with ``|P| <= p``, ``|M| <= m`` and ``|P| + |M| <= 2 s``. For every tilt ``|a| <= s`` the excess
+    over ``a M`` is at most ``p^2 / 4 + a^2`` if ``2 |a| <= q = min(m, 2 s - p)``, and ``p^2 / 4 - q^2 / 4 + |a| q`` otherwise:
+    ``P^2`` is at its largest for ``|M| <= 2 s - p``, and beyond that the boundary ``|P| = 2 s - |M|`` makes the excess
+    linear, falling outwards. For independent factors (p = m = 2 s) and ``a = +-s`` these are McCormick's planes, for
+    ``a = 0`` the band of affine arithmetic. Below it is the same with P and M exchanged.
+    """
+    star = torch.nan_to_num(likely @ product.tilts.mT)
+    inside = star.abs() <= product.free
+    tilt = torch.where(inside, -0.5 * star, -torch.sign(star) * product.size)
+    steep = tilt.abs()
+    cost = torch.where(2 * steep <= product.free, steep * steep, (steep - 0.25 * product.free) * product.free)
+    weights = parts * tilt
+    height = parts * ((product.top + cost) * (1.0 + 16 * UNIT))
+    through = weights.abs() * product.magnitude
+    gain = (height + parts * product.offset + weights.abs() * product.rounding).sum(-1, keepdim=True)
+    passed = (height + parts * product.middle + through).sum(-1, keepdim=True)
+    return torch.cat([gain, passed, weights @ product.tilts], dim=-1)
 
 
 def _collected(upper: Tensor, joined: list[tuple[int, int, int]], targets: range, operations: list[int]) -> Bounds:
@@ -160,7 +225,7 @@ def _structure(after: AffineForm) -> Any:
     return (
         after.coefficients.shape,
         tuple(
-            (r.name, r.first, r.coefficients.shape, r.operation, tuple(map(known, r.parameters)))
+            (r.name, r.first, r.coefficients.shape, r.error, r.operation, tuple(map(known, r.parameters)))
             for r in after.frame.relaxations
         ),
     )
@@ -183,12 +248,25 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
     for k in range(len(steps)):
         yield Step(
             output[k],
-            tuple(
-                Replacement(r.first, r.last, r.inverse[k], r.lines[k], None if r.input is None else r.input[k])
-                for r in stacked
-            ),
+            tuple(_at(r, k) for r in stacked),
+            _ellipsoid(steps[k].frame),
+            steps[k].frame.own_radius(frame.size - n),
             rounding,
         )
+
+
+def _at(stacked: Replacement, k: int) -> Replacement:
+    """The k-th of stacked replacements."""
+    first, last, inverse, lines, own, product = stacked
+    planes = None if product is None else Product(*(part[k] for part in product))
+    return Replacement(first, last, inverse[k], lines[k], None if own is None else own[k], planes)
+
+
+def _ellipsoid(frame: StepFrame) -> Tensor:
+    """Shape matrix of the state set's symbols, scaled to the extent of its box."""
+    square = frame.generators @ frame.generators.mT
+    scale = frame.reach / (square.diagonal(dim1=-2, dim2=-1).sqrt() + TINY)
+    return square * scale[..., None] * scale[..., None, :]
 
 
 def _kept(radius: Tensor, first: int) -> Replacement:
@@ -206,7 +284,14 @@ def _replacement(group: list[Relaxed], batch: torch.Size, steps: int) -> Replace
     radius = _stack(group, "radius", batch, like=magnitude)
     if r.operation is None:
         kept = _kept(torch.ones_like(radius), r.first)
-        return kept if r.name == "product" else kept._replace(input=None)
+        if r.factors is None:
+            return kept
+        # Lines in units of the error itself, as for planes.
+        return kept._replace(
+            inverse=(1.0 / radius)[..., None, :],
+            lines=kept.lines * torch.cat([radius, radius], dim=-1)[..., None],
+            product=_planes(group, batch, magnitude),
+        )
     error, coefficients = r.error, _rows(group, batch)
     missing = r.first - coefficients.shape[-1]
     coefficients = torch.nn.functional.pad(coefficients, (0, missing))
@@ -241,6 +326,32 @@ def _replacement(group: list[Relaxed], batch: torch.Size, steps: int) -> Replace
     )
 
 
+def _planes(group: list[Relaxed], batch: torch.Size, magnitude: Tensor) -> Product:
+    """A product in all steps."""
+    r, factors = group[0], [q.factors for q in group]
+    plus, minus, size, middle, carried = (
+        _stack(factors, name, batch) for name in ("plus", "minus", "size", "middle", "magnitude")
+    )
+    sums, differences = (_rows(factors, batch, name) for name in ("sum", "difference"))
+    tilts = torch.cat([differences, sums], dim=-2)
+    own = magnitude * ((2 * r.error + 24 * UNIT) * _SAFETY)
+    twice = torch.cat([carried, carried], dim=-1)
+
+    def both(upper: Tensor, lower: Tensor) -> Tensor:
+        return torch.cat([upper, lower], dim=-1)[..., None, :]
+
+    return Product(
+        tilts=torch.nn.functional.pad(tilts, (0, r.first - tilts.shape[-1])),
+        top=0.25 * both(plus * plus, minus * minus),
+        free=both(torch.minimum(minus, 2 * size - plus), torch.minimum(plus, 2 * size - minus)).clamp(min=0.0),
+        size=both(size, size),
+        offset=both(own - middle, own + middle),
+        middle=both(middle.abs(), middle.abs()),
+        magnitude=twice[..., None, :],
+        rounding=twice[..., None, :] * ((r.error + 8 * UNIT) * _SAFETY),
+    )
+
+
 def _lines(group: list[Relaxed], shape: torch.Size) -> Iterator[Tensor]:
     """The operation's lines in all steps, found in one call."""
     r = group[0]
@@ -262,7 +373,7 @@ def _stack(group: Sequence[Any], name: str, batch: torch.Size, like: Tensor | No
     return stacked.reshape(len(group), *batch, -1)
 
 
-def _rows(group: Sequence[Any], batch: torch.Size) -> Tensor:
+def _rows(group: Sequence[Any], batch: torch.Size, name: str = "coefficients") -> Tensor:
     """Coefficients of all steps, ``(steps, *batch, entries, variables)``."""
-    stacked = torch.stack([q.coefficients for q in group], dim=1)
+    stacked = torch.stack([getattr(q, name) for q in group], dim=1)
     return stacked.reshape(stacked.shape[0], len(group), *batch, -1).movedim(0, -1)

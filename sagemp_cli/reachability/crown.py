@@ -64,11 +64,13 @@ def backward_tube(steps: list[Step], runs: list[AffineRun], start: Box, *, rows:
     """
     centers = torch.stack([after.center for run in runs for after in run.steps], dim=-2)
     size = max(1, rows // (2 * start.dim))
-    pieces = [
-        backward(steps, start.radius, targets=range(first, min(first + size, len(steps)))).state
-        for first in range(0, len(steps), size)
-    ]
-    low, high = (torch.cat(side, dim=-2) for side in zip(*pieces, strict=True))
+    sides: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for first in range(0, len(steps), size):
+        targets = range(first, min(first + size, len(steps)))
+        bounds = both_ways(steps, start.radius, targets=targets)
+        for side, found in zip(sides, bounds.state, strict=True):
+            side.append(found)
+    low, high = (torch.cat(side, dim=-2) for side in sides)
     lower, upper = placed(centers, low, high)
     return Tube(
         torch.cat([start.lower[..., None, :], lower], dim=-2), torch.cat([start.upper[..., None, :], upper], dim=-2)

@@ -58,7 +58,7 @@ class RolloutSampler:
         offset = self.start.sample(count, generator) - self.start.center
         unit = 2 * torch.rand(count, offset.shape[-1], dtype=torch.float64, generator=generator) - 1
         share = torch.rand(count, 1, dtype=torch.float64, generator=generator)
-        late = 0.5 * share * offset + share * unit * self.spread
+        late = 0.2 * share * offset + share * unit * self.spread
         starts = references[:, 0] + torch.where(early[:, None], offset, late)
         w = self.disturbance.sample(count * self.length, generator).unflatten(0, (count, self.length))
         # Every second rollout is disturbed by constant extremes: independent noise averages out and teaches little.

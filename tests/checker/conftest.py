@@ -101,9 +101,13 @@ class Case:
         return write_artifact(path, Certificate(**(values | record)), header, overwrite=True)
 
 
-def make_case(robot: str = "unicycle", *, counts=(2, 1), propagator=None, hidden=(4, 4), side=0.0, **changes) -> Case:
-    """References are straight; ``side`` shifts a second one sideways, 0 makes one only."""
+def make_case(
+    robot: str = "unicycle", *, counts=(2, 1), propagator=None, hidden=(4, 4), side=0.0, disc=None, **changes
+) -> Case:
+    """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc."""
     config = config_of(robot, **changes)
+    if disc is not None:
+        config["scene"]["obstacles"][0]["center"] = disc
     problem = problem_from(config)
     n, m = problem.dynamics.state_dim, problem.dynamics.control_dim
     hover = {"planar_quadrotor": [0.5 * 9.81, 0.0], "quadrotor": [9.81, 0.0, 0.0, 0.0]}.get(robot, [0.0] * m)

@@ -166,7 +166,10 @@ def test_the_edges_of_a_band_are_lines():
     assert escapes(case, lower, upper, lines) == []
 
 
-@pytest.mark.parametrize("name", ["leaky relu 0.1", "sin", "cos", "clamp [-1.0, 1.0]"])
+@pytest.mark.parametrize(
+    "name",
+    ["leaky relu 0.1", "sin", "cos", "clamp [-1.0, 1.0]", "tanh", "sigmoid", "atan", "silu", "power 2", "power 3"],
+)
 def test_gradients_are_finite_also_for_degenerate_intervals(name):
     case = next(c for c in CASES if c.name == name)
     lower = torch.tensor([0.0, 1.0, 0.5 * math.pi, -1e-9, -0.3, -2.0, -9.0], dtype=torch.float64, requires_grad=True)

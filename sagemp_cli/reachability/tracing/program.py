@@ -179,7 +179,9 @@ class Recorder:
 
     def _check_written(self, ids: Tensor) -> None:
         if ids.numel() and int(ids.min()) < 0:
-            raise UsageError("step reads an entry that was never written (torch.empty_like leaves entries without a value)")
+            raise UsageError(
+                "step reads an entry that was never written (torch.empty_like leaves entries without a value)"
+            )
 
     def _gathered(self, unique: Tensor) -> int:
         """A slot whose entries are these ids, which are sorted."""

@@ -1,0 +1,213 @@
+"""The tube of any closed loop that is written in torch: the entry point for other people's robots and controllers."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
+from sagemp_cli.reachability.partition import parse_partitions, partition, uncertain_dimensions
+from sagemp_cli.reachability.propagator import Loop, Propagator
+from sagemp_cli.reachability.tracing.probing import Step, agree, probe, reproduced
+from sagemp_cli.reachability.tracing.program import Program
+from sagemp_cli.sets import Box, Tube
+
+PROPAGATORS = {
+    "affine": ("affine", "Affine"),
+    "auto_lirpa": ("auto_lirpa", "AutoLirpa"),
+    "best": ("best", "Best"),
+    "crown": ("crown", "Crown"),
+    "interval": ("interval", "Interval"),
+}
+"""Name to module of this package and class."""
+
+ROLLOUTS = 12
+"""Rollouts that are simulated to compare the step with its recorded program and with the tube."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedLoop:
+    """A stranger's loop as programs; what a propagator gets.
+
+    Attributes:
+        programs: one for all steps, or one per step.
+        horizon: number of steps K.
+        state_dim: number of states n.
+    """
+
+    programs: tuple[Program, ...]
+    horizon: int
+    state_dim: int
+
+    def step(self, k: int, x: Any, w: Any) -> Any:
+        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``, tensors or sets."""
+        return self.programs[k if len(self.programs) > 1 else 0](x, w)
+
+
+def reach(
+    step: Callable[[Any, Any], Any] | Loop,
+    start: Box,
+    disturbance: Box,
+    horizon: int | None = None,
+    *,
+    propagator: str | Propagator = "affine",
+    partitions: int | str | Sequence[int] = 1,
+    batched: bool | None = None,
+    cells_at_once: int = 64,
+) -> Tube:
+    """Tube ``(K+1, n)`` around every rollout ``x_{k+1} = step(x_k, w_k)``, ``x_0`` in ``start``, ``w_k`` in ``disturbance``.
+
+    ``step`` is any torch code, a neural network with float32 weights included. It is called on a few tensors, to see what shapes it
+    wants and that it is a function of its arguments, and recorded once on values that refuse what cannot be bounded. The propagator
+    gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants that meet ``x`` or ``w`` taken as the exact
+    numbers they are; what the step computes from constants alone is taken as torch computes it. A rollout simulated in float32 differs
+    by its own rounding, which is not enclosed.
+
+    Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness). A step whose
+    calls differ, or that leaves the recorded program on a simulated rollout, is refused.
+
+    Args:
+        step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it returns the next
+            state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose ``step(k, x, w)`` may depend on
+            the step number.
+        start: box ``(n,)`` of starts; sides of width zero are allowed.
+        disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n.
+        horizon: number of steps K; of a loop at most its own, and its own by default.
+        propagator: one of :data:`PROPAGATORS`, or a propagator itself.
+        partitions: cells of the start box in all, or counts per uncertain dimension (``"2x2"``, ``[2, 2]``).
+        batched: whether the step takes batches; None finds out.
+        cells_at_once: most cells in one call of the propagator, which bounds the memory.
+
+    Returns:
+        The smallest boxes around the tubes of all cells; row 0 is the start box. Where the sets overflow, rows are infinite.
+
+    Raises:
+        UnsupportedOperationError: an operation that cannot be bounded; the message names it and the line.
+        NonFiniteError: a constant or a result that is NaN or infinite.
+        UsageError: everything else that is wrong with the arguments or the step.
+    """
+    _check_box("start", start)
+    _check_box("disturbance", disturbance)
+    function, steps, varying = _function(step, start.dim, horizon)
+    chosen = _propagator(propagator)
+    if isinstance(cells_at_once, bool) or not isinstance(cells_at_once, int) or cells_at_once < 1:
+        raise UsageError(f"cells_at_once must be a positive integer, found {cells_at_once!r}")
+    uncertain = len(uncertain_dimensions(start))
+    counts = parse_partitions(partitions, max(uncertain, 1))
+    if uncertain == 0 and counts != [1]:
+        raise UsageError(f"partitions must be 1 for a start box that is a point, found {partitions!r}")
+    cells = partition(start, counts) if uncertain else Box(start.lower[None], start.upper[None])
+
+    called = probe(function, start, disturbance, batched=batched)
+    states, disturbances = _simulated(called, start, disturbance, steps)
+    loop = _recorded(called, states, disturbances, steps, varying)
+    chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
+    with torch.no_grad():
+        tubes = [chosen.propagate(loop, Box(low, high), disturbance) for low, high in chunks]
+    tube = Tube(torch.cat([t.lower for t in tubes]), torch.cat([t.upper for t in tubes])).hull()
+    _check_inside(tube, states)
+    return tube
+
+
+def _check_box(name: str, box: Any) -> None:
+    if not isinstance(box, Box):
+        raise UsageError(
+            f"{name} must be a Box, for instance Box.around([0.0, 0.0], [0.1, 0.1]), found {type(box).__name__}"
+        )
+    if box.lower.dim() != 1 or box.dim == 0:
+        raise UsageError(f"{name} must be one box of shape (n,), found shape {tuple(box.lower.shape)}")
+    if not bool(torch.isfinite(box.lower).all() & torch.isfinite(box.upper).all()):
+        raise NonFiniteError(f"{name} box must be finite")
+
+
+def _function(step: Any, n: int, horizon: Any) -> tuple[Callable[[int, Any, Any], Any], int, bool]:
+    """``(k, x, w) -> x_next``, the number of steps, and whether steps differ."""
+    is_loop = not callable(step) and callable(getattr(step, "step", None))
+    if not is_loop and not callable(step):
+        raise UsageError(
+            f"step must be a function step(x, w) or a loop with step(k, x, w), found {type(step).__name__}"
+        )
+    if is_loop and horizon is None:
+        horizon = step.horizon
+    try:
+        steps = operator.index(horizon)
+    except TypeError:
+        steps = 0
+    if steps < 1 or isinstance(horizon, bool):
+        raise UsageError(f"horizon must be a positive integer, found {horizon!r}")
+    if not is_loop:
+        return lambda k, x, w: step(x, w), steps, False
+    if step.state_dim != n:
+        raise UsageError(f"the loop has {step.state_dim} states, the start box has {n}")
+    if steps > step.horizon:
+        raise UsageError(f"horizon {steps} is longer than the loop's, {step.horizon}")
+    return step.step, steps, True
+
+
+def _propagator(propagator: str | Propagator) -> Propagator:
+    if not isinstance(propagator, str):
+        if not callable(getattr(propagator, "propagate", None)):
+            raise UsageError(f"propagator must be a name or have a method propagate, found {type(propagator).__name__}")
+        return propagator
+    if propagator not in PROPAGATORS:
+        raise UsageError(
+            f"propagator must be one of {', '.join(PROPAGATORS)}, found '{propagator}'{did_you_mean(propagator, PROPAGATORS)}"
+        )
+    module, name = PROPAGATORS[propagator]
+    return getattr(importlib.import_module(f"sagemp_cli.reachability.{module}"), name)()
+
+
+def _simulated(step: Step, start: Box, disturbance: Box, steps: int) -> tuple[Tensor, Tensor]:
+    """Rollouts ``(R, K+1, n)`` and their disturbances ``(R, K, d)``; NaN after an overflow."""
+    generator = torch.Generator().manual_seed(1)
+    x = start.sample(ROLLOUTS, generator)
+    corner = torch.rand(x.shape, generator=generator) < 0.5
+    x[::2] = torch.where(corner, start.lower, start.upper)[::2]
+    w = disturbance.sample(ROLLOUTS * steps, generator).unflatten(0, (ROLLOUTS, steps))
+    extreme = torch.where(torch.rand(w.shape, generator=generator) < 0.5, disturbance.lower, disturbance.upper)
+    w[::2] = extreme[::2]
+    states = torch.full((ROLLOUTS, steps + 1, start.dim), torch.nan, dtype=torch.float64)
+    states[:, 0] = x
+    with torch.no_grad():
+        for rollout, disturbances in zip(states, w, strict=True):
+            for k in range(steps):
+                after = step.at(k, rollout[k], disturbances[k])
+                if not bool(torch.isfinite(after).all()):
+                    break
+                rollout[k + 1] = after
+    return states, w
+
+
+def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, varying: bool) -> RecordedLoop:
+    """The loop as programs that do, on all simulated states, what the step does."""
+    before = torch.stack([step.at(0, x, w) for x, w in zip(states[:, 0], disturbances[:, 0], strict=True)])
+    programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
+    loop = RecordedLoop(programs, steps, states.shape[-1])
+    reproduced(step, states[:, 0], disturbances[:, 0], before)
+    for k in range(steps):
+        known = torch.isfinite(states[:, k + 1]).all(-1)
+        if bool(known.any()) and not agree(
+            loop.step(k, states[known, k], disturbances[known, k]), states[known, k + 1]
+        ):
+            raise UsageError(
+                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did when it was recorded; "
+                f"it must be a function of x and w only, in torch operations"
+            )
+    return loop
+
+
+def _check_inside(tube: Tube, states: Tensor) -> None:
+    """Refuse to return a tube that a simulated rollout leaves; rounding of the simulation is forgiven."""
+    slack = 1e-9 * (1.0 + states.abs())
+    out = (states < tube.lower - slack) | (states > tube.upper + slack)
+    if bool(out.any()):
+        _, k, i = torch.nonzero(out)[0].tolist()
+        raise SagempError(
+            f"a simulated rollout leaves the tube at step {k} in state {i}; no tube is returned, please report this"
+        )

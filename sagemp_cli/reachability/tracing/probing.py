@@ -1,0 +1,194 @@
+"""How a stranger's step is called, and whether it is what it must be: a function of ``x`` and ``w`` only.
+
+Calling a function a few times can refute, never prove. What is bounded in the end is a program that was recorded from one call
+(:mod:`sagemp_cli.reachability.tracing.value`); the calls made here make sure that the program says what the step does.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.tracing.program import Program, Recorder
+from sagemp_cli.reachability.tracing.value import Traced
+from sagemp_cli.sets import Box
+
+TOLERANCE = 1e-9
+"""How far two float64 evaluations of the same formulas may differ, relative to 1 plus the size of the result."""
+
+
+class _Exact(Tensor):
+    """float64 tensors that meet float32 constants as the exact numbers those are, where torch would refuse or round."""
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
+        with torch._C.DisableTorchFunctionSubclass():
+            args = _widened(tuple(args))
+            kwargs = {key: _widened(value) for key, value in (kwargs or {}).items()}
+        return super().__torch_function__(function, types, args, kwargs)
+
+
+def _widened(value: Any) -> Any:
+    if isinstance(value, (list, tuple)) and not hasattr(value, "_fields"):
+        return type(value)(map(_widened, value)) if any(map(_contains_tensor, value)) else value
+    narrow = isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float16, torch.bfloat16)
+    return value.detach().to(torch.float64) if narrow else value
+
+
+def _contains_tensor(value: Any) -> bool:
+    return isinstance(value, (Tensor, list, tuple))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a stranger's loop as it wants to be called.
+
+    Attributes:
+        function: ``(k, x, w) -> x_next``.
+        batched: whether it takes batches ``(B, n)`` and ``(B, d)`` only; else it takes ``(n,)`` and ``(d,)``.
+    """
+
+    function: Callable[[int, Any, Any], Any]
+    batched: bool = False
+
+    def at(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        """The next state ``(n,)`` from a state ``(n,)`` and a disturbance ``(d,)`` in plain float64."""
+        x, w = (v.detach().clone().as_subclass(_Exact) for v in (x, w))
+        if self.batched:
+            x, w = x[None], w[None]
+        result = self._called(k, x, w)
+        _check_result(result, x.shape)
+        plain = torch.as_tensor(result).detach().as_subclass(Tensor)
+        if plain.dtype.is_complex or plain.dtype is torch.bool:
+            raise UsageError(f"step returned numbers of type {plain.dtype}, expected real numbers")
+        return plain.to(torch.float64).reshape(-1).clone()
+
+    def record(self, k: int, x: Tensor, w: Tensor) -> Program:
+        """The program of step k, recorded at one state and disturbance."""
+        recorder = Recorder(x, w)
+        inputs = [
+            Traced(recorder, ids[None].clone() if self.batched else ids.clone()) for ids in (recorder.x, recorder.w)
+        ]
+        shape = inputs[0].shape
+        with torch.no_grad():
+            result = self._called(k, *inputs)
+        _check_result(result, shape)
+        if isinstance(result, Traced):
+            if result.recorder is not recorder:
+                raise UsageError("step returned a value of an earlier call; it must be a function of x and w only")
+            ids = result.ids
+        else:
+            ids = recorder.constant(result.detach().to(torch.float64))
+        return recorder.finish(ids.reshape(-1))
+
+    def _called(self, k: int, x: Any, w: Any) -> Any:
+        try:
+            return self.function(k, x, w)
+        except SagempError as error:
+            raise type(error)(f"{_line(error)}{error}") from error
+        except Exception as error:  # a stranger's code may raise anything
+            first = (str(error).strip().splitlines() or [""])[0]
+            kind = UnsupportedOperationError if isinstance(x, Traced) else UsageError
+            manner = "on sets" if isinstance(x, Traced) else f"on a state of shape {tuple(x.shape)}"
+            raise kind(f"{_line(error)}step fails {manner} with {type(error).__name__}: {first}") from error
+
+
+def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box, *, batched: bool | None) -> Step:
+    """The step, called the way it wants to be: tried on one state ``(n,)`` and on batches ``(B, n)``.
+
+    Raises:
+        UsageError: neither way gives states; or both do, but differ; or two calls with the same arguments differ.
+        NonFiniteError: NaN or infinity at a state of the start box.
+    """
+    generator = torch.Generator().manual_seed(0)
+    count = start.dim + disturbance.dim + 2  # unlike n, so that rows and columns cannot be taken for each other
+    xs, ws = start.sample(count, generator), disturbance.sample(count, generator)
+    single, why_single = (None, None) if batched is True else _tried(Step(function, batched=False), xs, ws)
+    rows, why_rows = (None, None) if batched is False else _tried(Step(function, batched=True), xs, ws)
+    together = None if rows is None else _batch(function, xs, ws)
+    if rows is not None and (together is None or not agree(together, rows)):
+        rows, why_rows = None, "the rows of a batch are not stepped one by one"
+    if single is not None and together is not None and not agree(together, single):
+        raise UsageError(
+            f"step means one thing for a state of shape ({start.dim},) and another for a batch ({count}, {start.dim}); "
+            f"say which is meant with batched=False or batched=True"
+        )
+    if single is None and rows is None:
+        tried = {"one state": why_single, "a batch": why_rows}
+        errors = [why for why in (why_single, why_rows) if isinstance(why, SagempError)]
+        if batched is not None or len({str(e) for e in errors}) == 1 and len(errors) == 2:
+            raise errors[0] if errors else UsageError(f"step does not work: {why_rows}")
+        raise UsageError("step works neither on " + " nor on ".join(f"{name} ({why})" for name, why in tried.items()))
+    step = Step(function, batched=single is None)
+    reproduced(step, xs, ws, rows if single is None else single)
+    return step
+
+
+def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
+    """Refuse a step that gives other results than before; under autograd, too."""
+    for grad in (False, True):
+        with torch.set_grad_enabled(grad):
+            after = torch.stack([step.at(0, x, w) for x, w in zip(xs, ws, strict=True)])
+        if not torch.equal(after, before):
+            raise UsageError(
+                f"step gives another result when it is called again with the same x and w (difference "
+                f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness (dropout: call "
+                f".eval()), no counters, no state kept between calls"
+            )
+
+
+def agree(a: Tensor, b: Tensor) -> bool:
+    """Whether two float64 evaluations agree up to rounding."""
+    return a.shape == b.shape and bool(((a - b).abs() <= TOLERANCE * (1.0 + b.abs())).all())
+
+
+def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, Any]:
+    """Results ``(B, n)`` of single calls, or why there are none."""
+    try:
+        with torch.no_grad():
+            states = torch.stack([step.at(0, x, w) for x, w in zip(xs, ws, strict=True)])
+    except SagempError as error:
+        return None, error
+    finite = torch.isfinite(states).all(-1)
+    if not bool(finite.all()):
+        i = int(finite.long().argmin())
+        return None, NonFiniteError(
+            f"step gives NaN or infinity in state {int(torch.isfinite(states[i]).long().argmin())} at x = {xs[i].tolist()}, "
+            f"w = {ws[i].tolist()} of the start and disturbance boxes"
+        )
+    return states, None
+
+
+def _batch(function: Callable[[int, Any, Any], Any], xs: Tensor, ws: Tensor) -> Tensor | None:
+    """Results of one call on the whole batch, None if that is no batch of states."""
+    try:
+        with torch.no_grad():
+            result = function(0, xs.clone().as_subclass(_Exact), ws.clone().as_subclass(_Exact))
+        return result.detach().as_subclass(Tensor).to(torch.float64) if result.shape == xs.shape else None
+    except Exception:  # a stranger's code may raise anything
+        return None
+
+
+def _check_result(result: Any, shape: torch.Size) -> None:
+    if not isinstance(result, (Tensor, Traced)):
+        raise UsageError(
+            f"step returned a {type(result).__name__}, expected the next state as a tensor of shape {tuple(shape)}"
+        )
+    if result.shape != shape:
+        raise UsageError(f"step returned shape {tuple(result.shape)}, expected {tuple(shape)} as that of x")
+
+
+def _line(error: BaseException) -> str:
+    """``"file.py, line 7: "`` of the stranger's own code that led to the error."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if not {"torch", "sagemp_cli", "numpy"} & set(path.parts) and not frame.filename.startswith("<"):
+            return f"{path.name}, line {frame.lineno}: "
+    return ""

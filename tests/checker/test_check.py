@@ -1,0 +1,202 @@
+import dataclasses
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from sagemp_cli.checker.check import check
+from sagemp_cli.cli.main import app
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.reachability.verdict import Outcome, Verdict
+from sagemp_cli.storage import Counterexample
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("robot", ["unicycle", "planar_quadrotor", "quadrotor"])
+@pytest.mark.parametrize("symbols", [None, 40])
+def test_what_the_affine_propagator_certifies_is_proved_again(robot, symbols, make, tmp_path):
+    case = make(robot, propagator=Affine(symbols=symbols), horizon=6)
+    report = check(case.write(tmp_path / "certificate.h5"))
+    assert report.answer == "VERIFIED" and not report.problems
+    assert [f.proved for f in report.findings] == [True]
+    assert report.cells == 2 and report.horizon == 6
+    # What is proved here is at least what the certificate says.
+    stored = dict(zip(case.verification.constraint_names, case.verification.clearance[0].tolist(), strict=True))
+    assert all(stored[name] <= value + 1e-12 for name, value in report.findings[0].clearance.items())
+
+
+def test_two_processes_find_the_same_as_one(case, certificate):
+    one, two = check(certificate), check(certificate, processes=2)
+    assert dataclasses.replace(one, seconds=0) == dataclasses.replace(two, seconds=0)
+
+
+def test_every_reference_of_a_file_is_checked(make, mutate, tmp_path):
+    path = make(side=0.1).write(tmp_path / "two.h5")
+    assert [f.proved for f in check(path).findings] == [True, True]
+
+    def shrink(file):
+        file["data/tubes/tube_upper"][3, 4, 0] -= 0.05
+
+    found = check(mutate(path, tmp_path / "mutant.h5", shrink))
+    assert found.answer == "UNKNOWN" and [f.proved for f in found.findings] == [True, False]
+    assert "cell 3, step 3: state 0 is only proved to lie in" in found.findings[1].reason
+
+
+def test_what_the_file_does_not_claim_is_not_proved(make, tmp_path):
+    path = make(disc=[0.4, 0.3]).write(tmp_path / "certificate.h5")
+    report = check(path)
+    assert (report.answer, report.claimed) == ("UNKNOWN", "UNKNOWN")
+    assert report.findings[0].reason == "the file does not claim that it is safe"
+    result = run(path)
+    assert result.exit_code == 5 and "reference 0: MAY_COLLIDE" in result.output
+
+
+def test_tubes_without_relaxations_cannot_be_checked(case, tmp_path):
+    bare = dataclasses.replace(case.verification, recording=None, propagator="auto_lirpa", rigorous=False)
+    path = dataclasses.replace(case, verification=bare).write(tmp_path / "certificate.h5")
+    report = check(path)
+    assert report.answer == "UNKNOWN"
+    assert report.problems == (
+        "the tubes were made by propagator 'auto_lirpa', which records no relaxations: they cannot be checked",
+    )
+    assert run(path).exit_code == 5
+
+
+def falsified(case, path, *, depth_step=8):
+    """A certificate with a rollout through the disc."""
+    loop = ClosedLoop(case.problem.dynamics, case.tracker, case.verification.references[0])
+    w = torch.zeros(8, 4, dtype=torch.float64)
+    states, _ = loop.rollout(case.problem.start.center, w)
+    unsafe = dataclasses.replace(case.verification, verdicts=(Verdict(Outcome.UNSAFE, depth_step, "disc"),))
+    example = Counterexample(
+        reference=0, kind="collision", step=depth_step, constraint="disc", depth=0.1, states=states.detach().numpy(),
+        disturbances=w.numpy(),
+    )  # fmt: skip
+    changed = dataclasses.replace(case, verification=unsafe)
+    return changed.write(path, verdict="FALSIFIED", counterexamples=(example,))
+
+
+def test_a_counterexample_is_replayed_and_proved(make, tmp_path):
+    path = falsified(make(disc=[0.6, 0.3]), tmp_path / "certificate.h5")
+    assert check(path).answer == "FALSIFIED"
+    assert run(path).exit_code == 10
+
+
+def test_a_counterexample_that_violates_nothing_or_cheats_proves_nothing(make, mutate, tmp_path):
+    clear = falsified(make(), tmp_path / "clear.h5")
+    assert check(clear).answer == "UNKNOWN"
+    path = falsified(make(disc=[0.6, 0.3]), tmp_path / "certificate.h5")
+
+    def outside_start(file):
+        file["data/counterexamples/000000/states"][0, 0] = 0.5
+
+    def outside_w(file):
+        file["data/counterexamples/000000/disturbances"][2, 0] = 0.5
+
+    for change in (outside_start, outside_w):
+        assert check(mutate(path, tmp_path / "mutant.h5", change)).answer == "UNKNOWN"
+
+
+def test_the_hash_alone_rejects_any_change(certificate, mutate, tmp_path):
+    datasets, attributes = [], []
+    with h5py.File(certificate) as file:
+        file.visititems(lambda name, node: datasets.append(name) if isinstance(node, h5py.Dataset) else None)
+        attributes += [("/", key) for key in file.attrs if not key.startswith(("schema", "content"))]
+        file.visititems(lambda name, node: attributes.extend((name, key) for key in node.attrs))
+    attributes = [(name, key) for name, key in attributes if not key.startswith("DIMENSION")]
+    assert len(datasets) > 25 and len(attributes) > 30
+
+    def of_dataset(name):
+        def change(file):
+            dataset = file[name]
+            if h5py.check_string_dtype(dataset.dtype):
+                dataset[...] = "x"
+            elif dataset.dtype.kind == "f":
+                flat = dataset[()].copy()
+                flat.flat[0] = np.nextafter(flat.flat[0], 9)
+                dataset[...] = flat
+            else:
+                dataset[...] = dataset[()] + 1
+
+        return change
+
+    def of_attribute(name, key):
+        def change(file):
+            value = file[name].attrs[key]
+            file[name].attrs[key] = value + "x" if isinstance(value, str) else value + 1
+
+        return change
+
+    changes = [of_dataset(name) for name in datasets] + [of_attribute(*place) for place in attributes]
+    for change in changes:
+        path = mutate(certificate, tmp_path / "mutant.h5", change, rehash=False)
+        with pytest.raises(ArtifactError, match=r"the content was changed after it was written \(its hash differs\)"):
+            check(path)
+
+
+def test_a_hash_does_not_depend_on_how_the_file_is_stored(certificate, mutate, tmp_path):
+    def repack(file):
+        data = file["data/tubes/tube_lower"][()]
+        attributes = dict(file["data/tubes/tube_lower"].attrs)
+        del file["data/tubes/tube_lower"]
+        node = file["data/tubes"].create_dataset("tube_lower", data=data, compression="gzip", compression_opts=9)
+        for key, value in attributes.items():
+            node.attrs[key] = value
+
+    assert check(mutate(certificate, tmp_path / "packed.h5", repack, rehash=False)).answer == "VERIFIED"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.attrs.__setitem__("schema_version", 9), "format 9 of 'sagemp/certificate' is newer than this"),
+        (lambda f: f.attrs.__setitem__("schema", "sagemp/tracker"), "only sagemp/certificate and sagemp/library can"),
+        (lambda f: f.attrs.__delitem__("content_sha256"), "has no content hash"),
+        (lambda f: f["data/tubes"].__setitem__("copy", h5py.SoftLink("/data")), "/data/tubes/copy is a link"),
+        (lambda f: f["data/tubes"].__setitem__("out", h5py.ExternalLink("o.h5", "/")), "/data/tubes/out is a link"),
+    ],
+)
+def test_a_file_that_is_no_certificate_of_this_format_is_refused(change, message, certificate, mutate, tmp_path):
+    path = mutate(certificate, tmp_path / "mutant.h5", change, rehash=False)
+    with pytest.raises(ArtifactError, match=message):
+        check(path)
+    result = run(path)
+    assert result.exit_code == 2 and message in result.stderr
+
+
+def test_a_config_that_names_a_foreign_class_is_refused(certificate, mutate, tmp_path):
+    def change(file):
+        text = file["config"].asstr()[()].replace("sagemp_cli.dynamics.unicycle.Unicycle", "os.system")
+        del file["config"]
+        file.create_dataset("config", data=text, dtype=h5py.string_dtype())
+
+    with pytest.raises(ArtifactError, match="/config does not describe a problem"):
+        check(mutate(certificate, tmp_path / "mutant.h5", change))
+
+
+def test_a_file_cut_off_at_any_place_is_refused(certificate, tmp_path):
+    data, path = certificate.read_bytes(), tmp_path / "cut.h5"
+    for size in (0, 10, len(data) // 3, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(ArtifactError, match="not a certificate, or a damaged one"):
+            check(path)
+    with pytest.raises(ArtifactError, match="no such file"):
+        check(tmp_path / "none.h5")
+
+
+def test_the_command_says_what_was_proved(certificate, tmp_path):
+    shutil.copy(certificate, tmp_path / "certificate.h5")
+    result = run(tmp_path / "certificate.h5")
+    assert result.exit_code == 0
+    assert "VERIFIED: 1 of 1 references proved, 2 cells, K = 8 (the file claims VERIFIED)" in result.output
+    assert "reference 0: proved, keeps 0.467 m from disc" in result.output
+    as_json = run(tmp_path / "certificate.h5", "--json")
+    assert as_json.exit_code == 0 and '"answer": "VERIFIED"' in as_json.output

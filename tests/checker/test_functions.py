@@ -1,0 +1,77 @@
+import math
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sagemp_cli.checker.balls import Unproved
+from sagemp_cli.checker.functions import FUNCTIONS, clamp, elu, integer_power, leaky_relu, softplus
+
+NAMED = {
+    **FUNCTIONS,
+    "leaky_relu": leaky_relu(0.1),
+    "clamp": clamp(-0.5, 1.5),
+    "clamp from below": clamp(0.25, None),
+    "elu": elu(1.0),
+    "softplus": softplus(2.0, 20.0),
+    "square": integer_power(2),
+    "cube": integer_power(3),
+    "inverse square": integer_power(-2),
+}
+POSITIVE = ("log", "sqrt", "reciprocal", "inverse square")
+
+
+@pytest.fixture(autouse=True)
+def precision():
+    with ctx.workprec(128):
+        yield
+
+
+@pytest.mark.parametrize("name", NAMED)
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-6, 6), st.floats(-12, 3), st.floats(-2, 2))
+def test_no_point_of_the_graph_lies_outside_and_both_bounds_are_nearly_met(name, middle, size, slope):
+    function, width = NAMED[name], math.exp(size)
+    if name in POSITIVE:
+        middle = abs(middle) + 0.6 * width + 1e-3
+    if name == "tan":
+        middle, width = math.remainder(middle, math.pi) * 0.4, min(width, 0.5)
+    with ctx.workprec(128):
+        low, high, s = arb(middle - width / 2), arb(middle + width / 2), arb(slope)
+        least, most = function.excess(s, low, high)
+        values = []
+        for x in np.linspace(float(low), float(high), 301):
+            x = arb(float(x)).max(low).min(high)
+            y = function.value(x) - s * x
+            assert not (y < least) and not (y > most)
+            values.append(float(y))
+        coarse = 1e-9 + 1e-2 * (max(values) - min(values)) + 1e-3 * width
+        assert float(least) >= min(values) - coarse and float(most) <= max(values) + coarse
+
+
+def test_the_bounds_of_sine_over_many_periods_are_those_of_its_extrema():
+    least, most = FUNCTIONS["sin"].excess(arb(0), arb(-50), arb(60))
+    assert abs(float(least) + 1) < 1e-12 and abs(float(most) - 1) < 1e-12
+
+
+def test_a_straight_piece_with_its_own_slope_has_no_excess_at_all():
+    least, most = leaky_relu(0.1).excess(arb(0.1), arb(-3.7), arb(-0.3))
+    assert least == 0 and most == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("reciprocal", -1.0, 2.0), ("log", -1.0, 1.0), ("tan", 1.0, 2.0), ("sqrt", -1.0, 4.0), ("inverse square", -1, 1)],
+)
+def test_an_interval_with_a_pole_is_not_bounded(name, low, high):
+    with pytest.raises(Unproved):
+        NAMED[name].excess(arb(0.5), arb(low), arb(high))
+
+
+@pytest.mark.parametrize("bad", [arb("nan"), arb("inf"), arb(0, "inf")])
+def test_nothing_follows_from_numbers_that_are_not_finite(bad):
+    for arguments in ((bad, arb(0), arb(1)), (arb(0), bad, arb(1)), (arb(0), arb(0), bad)):
+        with pytest.raises(Unproved, match="not finite"):
+            FUNCTIONS["sin"].excess(*arguments)
