@@ -61,21 +61,21 @@ def reach(
     batched: bool | None = None,
     cells_at_once: int = 64,
 ) -> Tube:
-    """Tube ``(K+1, n)`` around every rollout ``x_{k+1} = step(x_k, w_k)``, ``x_0`` in ``start``, ``w_k`` in ``disturbance``.
+    """Tube ``(K+1, n)`` around all rollouts ``x_{k+1} = step(x_k, w_k)`` with ``x_0`` and ``w_k`` in their boxes.
 
-    ``step`` is any torch code, a neural network with float32 weights included. It is called on a few tensors, to see what shapes it
-    wants and that it is a function of its arguments, and recorded once on values that refuse what cannot be bounded. The propagator
-    gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants that meet ``x`` or ``w`` taken as the exact
-    numbers they are; what the step computes from constants alone is taken as torch computes it. A rollout simulated in float32 differs
-    by its own rounding, which is not enclosed.
+    ``step`` is any torch code, a neural network with float32 weights included. It is called on a few tensors, to see what
+    shapes it wants and that it is a function of its arguments, and recorded once on values that refuse what cannot be
+    bounded. The propagator gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants that meet
+    ``x`` or ``w`` taken as the exact numbers they are; what the step computes from constants alone is taken as torch
+    computes it. A simulated rollout differs by its own rounding (noticeably in float32), which is not enclosed.
 
-    Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness). A step whose
-    calls differ, or that leaves the recorded program on a simulated rollout, is refused.
+    Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness). A
+    step whose calls differ, or that leaves the recorded program on a simulated rollout, is refused.
 
     Args:
-        step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it returns the next
-            state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose ``step(k, x, w)`` may depend on
-            the step number.
+        step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it returns
+            the next state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose
+            ``step(k, x, w)`` may depend on the step number.
         start: box ``(n,)`` of starts; sides of width zero are allowed.
         disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n.
         horizon: number of steps K; of a loop at most its own, and its own by default.
@@ -85,7 +85,7 @@ def reach(
         cells_at_once: most cells in one call of the propagator, which bounds the memory.
 
     Returns:
-        The smallest boxes around the tubes of all cells; row 0 is the start box. Where the sets overflow, rows are infinite.
+        The smallest boxes around the tubes of all cells; row 0 is the start box. Rows are infinite after an overflow.
 
     Raises:
         UnsupportedOperationError: an operation that cannot be bounded; the message names it and the line.
@@ -157,7 +157,8 @@ def _propagator(propagator: str | Propagator) -> Propagator:
         return propagator
     if propagator not in PROPAGATORS:
         raise UsageError(
-            f"propagator must be one of {', '.join(PROPAGATORS)}, found '{propagator}'{did_you_mean(propagator, PROPAGATORS)}"
+            f"propagator must be one of {', '.join(PROPAGATORS)}, found '{propagator}'"
+            f"{did_you_mean(propagator, PROPAGATORS)}"
         )
     module, name = PROPAGATORS[propagator]
     return getattr(importlib.import_module(f"sagemp_cli.reachability.{module}"), name)()
@@ -175,18 +176,18 @@ def _simulated(step: Step, start: Box, disturbance: Box, steps: int) -> tuple[Te
     states = torch.full((ROLLOUTS, steps + 1, start.dim), torch.nan, dtype=torch.float64)
     states[:, 0] = x
     with torch.no_grad():
-        for rollout, disturbances in zip(states, w, strict=True):
-            for k in range(steps):
-                after = step.at(k, rollout[k], disturbances[k])
-                if not bool(torch.isfinite(after).all()):
-                    break
-                rollout[k + 1] = after
+        for k in range(steps):
+            alive = torch.isfinite(states[:, k]).all(-1)
+            if not bool(alive.any()):
+                break
+            after = step.all(k, states[alive, k], w[alive, k])
+            states[alive, k + 1] = torch.where(torch.isfinite(after).all(-1, keepdim=True), after, torch.nan)
     return states, w
 
 
 def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, varying: bool) -> RecordedLoop:
     """The loop as programs that do, on all simulated states, what the step does."""
-    before = torch.stack([step.at(0, x, w) for x, w in zip(states[:, 0], disturbances[:, 0], strict=True)])
+    before = step.all(0, states[:, 0], disturbances[:, 0])
     programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
     loop = RecordedLoop(programs, steps, states.shape[-1])
     reproduced(step, states[:, 0], disturbances[:, 0], before)
@@ -196,8 +197,8 @@ def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, vary
             loop.step(k, states[known, k], disturbances[known, k]), states[known, k + 1]
         ):
             raise UsageError(
-                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did when it was recorded; "
-                f"it must be a function of x and w only, in torch operations"
+                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did when "
+                f"it was recorded; it must be a function of x and w only, in torch operations"
             )
     return loop
 

@@ -107,6 +107,17 @@ class Bounds:
     state: tuple[Tensor, Tensor]
     inputs: list[list[tuple[Tensor, Tensor] | None]]
 
+    def intersected(self, other: Bounds) -> Bounds:
+        """What holds if both hold."""
+
+        def both(a: Any, b: Any) -> Any:
+            return None if a is None else (torch.maximum(a[0], b[0]), torch.minimum(a[1], b[1]))
+
+        inputs = [
+            [both(a, b) for a, b in zip(*step, strict=True)] for step in zip(self.inputs, other.inputs, strict=True)
+        ]
+        return Bounds(both(self.state, other.state), inputs)
+
 
 def compiled(steps: Sequence[AffineForm]) -> list[Step]:
     """The recorded steps, ready for rows; equal structures are stacked, so that each line is found in one call for all of them."""
@@ -116,20 +127,25 @@ def compiled(steps: Sequence[AffineForm]) -> list[Step]:
     return parts
 
 
-def backward(
-    steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False, tilted: bool = True
-) -> Bounds:
+def backward(steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False) -> Bounds:
     """Bounds of the states after the target steps (and of all operations' inputs in these steps) over the start box.
 
-    All targets go back in one sweep; a target joins when the sweep comes by.
+    Two sweeps, one with tilted and one with level planes over products; neither is always the better one.
 
     Args:
         steps: from :func:`compiled`, step 0 first.
         radius: of the start box, ``(*batch, n)``.
         targets: the steps whose results are bounded.
         inputs: whether the operations' inputs are bounded too.
-        tilted: whether planes over a product's factors are tilted for each row, or level as in affine arithmetic.
     """
+    level = _swept(steps, radius, targets, inputs, False)
+    if all(r.product is None for step in steps for r in step.replacements):
+        return level
+    return level.intersected(_swept(steps, radius, targets, inputs, True))
+
+
+def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, tilted: bool) -> Bounds:
+    """All targets go back in one sweep; a target joins when the sweep comes by."""
     n = radius.shape[-1]
     rows = radius.new_zeros(*radius.shape[:-1], 0, 1 + n)
     unit = torch.cat([torch.eye(n), -torch.eye(n)]).to(rows)
@@ -235,7 +251,10 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
     """Steps of one structure."""
     frame = steps[0].frame
     batch, n, inputs = frame.batch, frame.states, frame.inputs
-    stacked = [_replacement(list(group), batch, len(steps)) for group in zip(*(s.frame.relaxations for s in steps), strict=True)]
+    stacked = [
+        _replacement(list(group), batch, len(steps))
+        for group in zip(*(s.frame.relaxations for s in steps), strict=True)
+    ]
     first = torch.stack([s.frame.disturbance_radius for s in steps])
     first = first.reshape(len(steps), *[1] * len(batch), inputs - n).expand(len(steps), *batch, inputs - n)
     stacked.insert(0, _kept(first, n))
@@ -362,9 +381,7 @@ def _lines(group: list[Relaxed], shape: torch.Size) -> Iterator[Tensor]:
 def _signed(carried: Tensor, magnitude: Tensor, coefficients: Tensor) -> Tensor:
     """Rows for entries and for minus the entries: error carried, magnitude, coefficients."""
     lead = torch.stack([carried, magnitude], dim=-1)
-    return torch.cat(
-        [torch.cat([lead, coefficients], dim=-1), torch.cat([lead, -coefficients], dim=-1)], dim=-2
-    )
+    return torch.cat([torch.cat([lead, coefficients], dim=-1), torch.cat([lead, -coefficients], dim=-1)], dim=-2)
 
 
 def _stack(group: Sequence[Any], name: str, batch: torch.Size, like: Tensor | None = None) -> Tensor:

@@ -8,8 +8,6 @@ that and of the forward pass's box. All bounds enclose the same rollouts, so the
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +16,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine import Affine, AffineRun
-from sagemp_cli.reachability.affine_form import Hints
+from sagemp_cli.reachability.affine_form import Hints, Relaxed
 from sagemp_cli.reachability.backward import Step, backward, compiled
 from sagemp_cli.reachability.batch import batched_start
 from sagemp_cli.reachability.crown import backward_tube, placed
@@ -58,27 +56,49 @@ class Best:
         runs: list[AffineRun] = []
         steps: list[Step] = []
         for first in range(0, loop.horizon, self.window):
-            last = min(first + self.window, loop.horizon)
+            window = range(first, min(first + self.window, loop.horizon))
             before = runs[-1] if runs else None
             hints = None
-            for _ in range(self.rounds + 1):
+            for attempt in range(self.rounds + 1):
                 run = affine.run(
-                    loop, start, disturbance, first=first, horizon=last, before=before, keep_steps=True, hints=hints
+                    loop,
+                    start,
+                    disturbance,
+                    first=first,
+                    horizon=window.stop,
+                    before=before,
+                    keep_steps=True,
+                    hints=hints,
                 )
                 ahead = compiled(run.steps)
-                if len(hints or ()) < 1 or _ + 1 < self.rounds + 1:
-                    hints = self._hints(steps + ahead, run, start, range(first, last))
+                if attempt < self.rounds:
+                    hints = _hints(run, steps + ahead, start, window, self.rows)
             runs.append(run)
             steps += ahead
-        backward_ = backward_tube(steps, runs, start, rows=self.rows)
-        return backward_
+        found = backward_tube(steps, runs, start, rows=self.rows)
+        lower = torch.cat([runs[0].tube.lower[..., :1, :], *(r.tube.lower[..., 1:, :] for r in runs)], dim=-2)
+        upper = torch.cat([runs[0].tube.upper[..., :1, :], *(r.tube.upper[..., 1:, :] for r in runs)], dim=-2)
+        return Tube(torch.maximum(lower, found.lower), torch.minimum(upper, found.upper))
 
-    def _hints(self, steps, run, start, targets) -> list[Hints]:
-        found = backward(steps, start.radius, targets=targets, inputs=True).inputs
-        return [
-            [
-                None if bounds is None else tuple(x.reshape(r.center.shape) for x in placed(r.center.flatten(len(r.radius.shape)-1), *bounds))
-                for r, bounds in zip(after.frame.relaxations, operations, strict=True)
-            ]
-            for after, operations in zip(run.steps, found, strict=True)
+
+def _hints(run: AffineRun, steps: list[Step], start: Box, window: range, rows: int) -> list[Hints]:
+    """Bounds of all operations' inputs in a window, from a backward sweep through all steps up to its end."""
+    per_step = 2 * start.dim + sum(r.input.shape[-2] for r in steps[-1].replacements if r.input is not None)
+    size = max(1, rows // per_step)
+    found: list[list[tuple[Tensor, Tensor] | None]] = []
+    for first in range(window.start, window.stop, size):
+        targets = range(first, min(first + size, window.stop))
+        found += backward(steps, start.radius, targets=targets, inputs=True).inputs
+    return [
+        [
+            None if bounds is None else _placed_input(operation, bounds)
+            for operation, bounds in zip(after.frame.relaxations, operations, strict=True)
         ]
+        for after, operations in zip(run.steps, found, strict=True)
+    ]
+
+
+def _placed_input(operation: Relaxed, bounds: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Bounds of an operation's input in its own shape."""
+    low, high = (side.reshape(operation.center.shape) for side in bounds)
+    return placed(operation.center, low, high)

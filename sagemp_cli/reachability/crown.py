@@ -67,7 +67,7 @@ def backward_tube(steps: list[Step], runs: list[AffineRun], start: Box, *, rows:
     sides: tuple[list[Tensor], list[Tensor]] = ([], [])
     for first in range(0, len(steps), size):
         targets = range(first, min(first + size, len(steps)))
-        bounds = both_ways(steps, start.radius, targets=targets)
+        bounds = backward(steps, start.radius, targets=targets)
         for side, found in zip(sides, bounds.state, strict=True):
             side.append(found)
     low, high = (torch.cat(side, dim=-2) for side in sides)

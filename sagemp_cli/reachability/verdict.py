@@ -13,6 +13,7 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
+from sagemp_cli.errors import UsageError
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
 
@@ -77,8 +78,15 @@ class Assessment:
     goal_margin: Tensor
 
 
-def assess(tube: Tube, scene: Scene, *, position: Sequence[int], state_names: Sequence[str]) -> Assessment:
-    """Judge the tubes ``(R, C, K+1, n)`` of R references, each with C cells that together cover its start box.
+def assess(
+    tube: Tube,
+    scene: Scene,
+    *,
+    cell_reference: Tensor,
+    position: Sequence[int],
+    state_names: Sequence[str],
+) -> Assessment:
+    """Judge the tubes ``(C, K+1, n)`` of the cells of R references; those of one together cover its start box.
 
     SAFE needs every cell's tube to be finite, clear of all constraints at every step k = 0..K and inside the goal at
     K. The paper asks for k = 1..K only; a start box in collision is not called safe here. A tube that touches an
@@ -88,26 +96,27 @@ def assess(tube: Tube, scene: Scene, *, position: Sequence[int], state_names: Se
     Args:
         tube: bounds; NaN counts as an overflow.
         scene: constraints and goal.
+        cell_reference: which reference each cell belongs to, ``(C,)``, each of 0..R-1 at least once.
         position: indices of the states that are the position.
         state_names: names for messages, n of them.
-    """
-    finite = torch.isfinite(tube.lower) & torch.isfinite(tube.upper)
-    everywhere = torch.full_like(tube.lower, torch.inf)
-    lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
 
-    index = list(position)
-    clearances = scene.clearances(Box(lower[..., index], upper[..., index])).amin(1)  # (R, K+1, constraints)
-    goal_margin = torch.minimum(
-        _margin(lower[..., -1, :], scene.goal.lower), _margin(-upper[..., -1, :], -scene.goal.upper)
-    ).amin(1)
-    reaches = scene.goal.contains(Box(lower[..., -1, :], upper[..., -1, :])).all(1)
-    overflow = ~finite.all(1)  # (R, K+1, n)
+    Raises:
+        UsageError: a reference without cells, of which nothing is proved.
+    """
+    count = int(cell_reference.max()) + 1 if len(cell_reference) else 0
+    if len(cell_reference) != len(tube.lower) or not torch.equal(cell_reference.unique(), torch.arange(count)):
+        raise UsageError(f"every one of {count} references needs cells, and every cell a reference")
+    found = _measure(tube, scene, position)
+    clearances = _least(found.clearances, cell_reference, count)  # (R, K+1, constraints)
+    goal_margin = _least(found.goal_margin, cell_reference, count)
+    reaches = _least(found.reaches, cell_reference, count)
+    finite = _least(found.finite, cell_reference, count)  # (R, K+1, n)
 
     verdicts = []
-    for r in range(tube.lower.shape[0]):
-        if bool(overflow[r].any()):
-            step = _first(overflow[r].any(-1))
-            verdicts.append(Verdict(Outcome.UNBOUNDED, step, state_names[_first(overflow[r, step])]))
+    for r in range(count):
+        if not bool(finite[r].all()):
+            step = _first(~finite[r].all(-1))
+            verdicts.append(Verdict(Outcome.UNBOUNDED, step, state_names[_first(~finite[r, step])]))
         elif not bool((clearances[r] > 0).all()):
             step = _first(~(clearances[r] > 0).all(-1))
             name = scene.constraint_names[int(clearances[r, step].argmin())]
@@ -118,6 +127,57 @@ def assess(tube: Tube, scene: Scene, *, position: Sequence[int], state_names: Se
         else:
             verdicts.append(Verdict(Outcome.SAFE))
     return Assessment(tuple(verdicts), clearances.amin(1), goal_margin)
+
+
+def shortfall(tube: Tube, scene: Scene, *, position: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """How far each of the tubes ``(C, K+1, n)`` is from being SAFE by itself.
+
+    Returns:
+        Whether it is SAFE, as in :func:`assess`, ``(C,)``; and a measure of what is missing, 0 if nothing is, ``(C,)``: the
+        sum over all steps, constraints and faces of the goal of ``log(1 + depth)``. It guides, it proves nothing.
+    """
+    found = _measure(tube, scene, position)
+    safe = found.finite.flatten(1).all(1) & (found.clearances > 0).flatten(1).all(1) & found.reaches
+    depth = torch.log1p((-found.clearances).clamp(min=0.0, max=_HUGE)).sum((1, 2))
+    short = torch.log1p((-found.goal_margin).clamp(min=0.0, max=_HUGE)).sum(1)
+    return safe, torch.where(safe, 0.0, depth + tube.horizon * short)
+
+
+_HUGE = 1e300
+
+
+@dataclass(frozen=True)
+class _Measures:
+    """Of each cell: bounds that are finite, clearances and goal margins, and whether it ends in the goal."""
+
+    finite: Tensor
+    clearances: Tensor
+    goal_margin: Tensor
+    reaches: Tensor
+
+
+def _measure(tube: Tube, scene: Scene, position: Sequence[int]) -> _Measures:
+    finite = torch.isfinite(tube.lower) & torch.isfinite(tube.upper)
+    everywhere = torch.full_like(tube.lower, torch.inf)
+    lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
+    index = list(position)
+    goal_margin = torch.minimum(
+        _margin(lower[..., -1, :], scene.goal.lower), _margin(-upper[..., -1, :], -scene.goal.upper)
+    )
+    return _Measures(
+        finite,
+        scene.clearances(Box(lower[..., index], upper[..., index])),
+        goal_margin,
+        scene.goal.contains(Box(lower[..., -1, :], upper[..., -1, :])),
+    )
+
+
+def _least(values: Tensor, owner: Tensor, count: int) -> Tensor:
+    """The least value (of flags: whether all hold) over the cells of each reference, ``(R, ...)``."""
+    numbers = values.double() if values.dtype == torch.bool else values
+    index = owner.reshape(-1, *[1] * (values.dim() - 1)).expand(values.shape)
+    least = torch.full((count, *values.shape[1:]), torch.inf, dtype=numbers.dtype)
+    return least.scatter_reduce(0, index, numbers, "amin").to(values.dtype)
 
 
 def answer_of(verdicts: Sequence[Verdict]) -> Answer:

@@ -1,7 +1,7 @@
 """How a stranger's step is called, and whether it is what it must be: a function of ``x`` and ``w`` only.
 
-Calling a function a few times can refute, never prove. What is bounded in the end is a program that was recorded from one call
-(:mod:`sagemp_cli.reachability.tracing.value`); the calls made here make sure that the program says what the step does.
+Calling a function a few times can refute, never prove. What is bounded in the end is a program recorded from one call
+(:mod:`sagemp_cli.reachability.tracing.value`); the calls made here test that the program says what the step does.
 """
 
 from __future__ import annotations
@@ -53,22 +53,26 @@ class Step:
     Attributes:
         function: ``(k, x, w) -> x_next``.
         batched: whether it takes batches ``(B, n)`` and ``(B, d)`` only; else it takes ``(n,)`` and ``(d,)``.
+        rowwise: whether it may be called on batches to save time, because it steps their rows one by one.
     """
 
     function: Callable[[int, Any, Any], Any]
     batched: bool = False
+    rowwise: bool = False
+
+    def all(self, k: int, xs: Tensor, ws: Tensor) -> Tensor:
+        """The next states ``(B, n)`` from states ``(B, n)`` and disturbances ``(B, d)`` in plain float64."""
+        if self.rowwise:
+            xs, ws = (v.detach().clone().as_subclass(_Exact) for v in (xs, ws))
+            return self._plain(self._called(k, xs, ws), xs.shape)
+        return torch.stack([self.at(k, x, w) for x, w in zip(xs, ws, strict=True)])
 
     def at(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """The next state ``(n,)`` from a state ``(n,)`` and a disturbance ``(d,)`` in plain float64."""
         x, w = (v.detach().clone().as_subclass(_Exact) for v in (x, w))
         if self.batched:
             x, w = x[None], w[None]
-        result = self._called(k, x, w)
-        _check_result(result, x.shape)
-        plain = torch.as_tensor(result).detach().as_subclass(Tensor)
-        if plain.dtype.is_complex or plain.dtype is torch.bool:
-            raise UsageError(f"step returned numbers of type {plain.dtype}, expected real numbers")
-        return plain.to(torch.float64).reshape(-1).clone()
+        return self._plain(self._called(k, x, w), x.shape).reshape(-1)
 
     def record(self, k: int, x: Tensor, w: Tensor) -> Program:
         """The program of step k, recorded at one state and disturbance."""
@@ -88,6 +92,13 @@ class Step:
             ids = recorder.constant(result.detach().to(torch.float64))
         return recorder.finish(ids.reshape(-1))
 
+    def _plain(self, result: Any, shape: torch.Size) -> Tensor:
+        _check_result(result, shape)
+        plain = result.detach().as_subclass(Tensor)
+        if plain.dtype.is_complex or plain.dtype is torch.bool:
+            raise UsageError(f"step returned numbers of type {plain.dtype}, expected real numbers")
+        return plain.to(torch.float64).clone()
+
     def _called(self, k: int, x: Any, w: Any) -> Any:
         try:
             return self.function(k, x, w)
@@ -96,7 +107,8 @@ class Step:
         except Exception as error:  # a stranger's code may raise anything
             first = (str(error).strip().splitlines() or [""])[0]
             kind = UnsupportedOperationError if isinstance(x, Traced) else UsageError
-            manner = "on sets" if isinstance(x, Traced) else f"on a state of shape {tuple(x.shape)}"
+            shapes = f"a state of shape {tuple(x.shape)} and a disturbance of shape {tuple(w.shape)}"
+            manner = "on sets" if isinstance(x, Traced) else f"on {shapes}"
             raise kind(f"{_line(error)}step fails {manner} with {type(error).__name__}: {first}") from error
 
 
@@ -110,37 +122,40 @@ def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box
     generator = torch.Generator().manual_seed(0)
     count = start.dim + disturbance.dim + 2  # unlike n, so that rows and columns cannot be taken for each other
     xs, ws = start.sample(count, generator), disturbance.sample(count, generator)
-    single, why_single = (None, None) if batched is True else _tried(Step(function, batched=False), xs, ws)
-    rows, why_rows = (None, None) if batched is False else _tried(Step(function, batched=True), xs, ws)
-    together = None if rows is None else _batch(function, xs, ws)
-    if rows is not None and (together is None or not agree(together, rows)):
-        rows, why_rows = None, "the rows of a batch are not stepped one by one"
-    if single is not None and together is not None and not agree(together, single):
+    unit = UsageError("not tried")
+    single, why_single = (None, unit) if batched is True else _tried(Step(function), xs, ws)
+    rows, why_rows = (None, unit) if batched is False else _tried(Step(function, batched=True), xs, ws)
+    together = None if batched is False else _tried(Step(function, batched=True, rowwise=True), xs, ws)[0]
+    if single is None and rows is None:
+        if batched is None and type(why_single) is type(why_rows) and type(why_single) is not UsageError:
+            raise why_single
+        if batched is not None:
+            raise why_rows if batched else why_single
+        raise UsageError(f"step works neither on one state ({why_single}) nor on a batch ({why_rows})")
+    first = rows if single is None else single
+    reproduced(Step(function, batched=single is None), xs, ws, first)
+    # A batch means something only if its rows are stepped one by one: x[0] of a batch is a row, not a state's entry.
+    rowwise = rows is not None and together is not None and agree(together, rows)
+    if single is None and not rowwise:
+        raise UsageError("step mixes the rows of a batch: a row's next state depends on the other rows")
+    if rowwise and not agree(rows, first):
         raise UsageError(
             f"step means one thing for a state of shape ({start.dim},) and another for a batch ({count}, {start.dim}); "
             f"say which is meant with batched=False or batched=True"
         )
-    if single is None and rows is None:
-        tried = {"one state": why_single, "a batch": why_rows}
-        errors = [why for why in (why_single, why_rows) if isinstance(why, SagempError)]
-        if batched is not None or len({str(e) for e in errors}) == 1 and len(errors) == 2:
-            raise errors[0] if errors else UsageError(f"step does not work: {why_rows}")
-        raise UsageError("step works neither on " + " nor on ".join(f"{name} ({why})" for name, why in tried.items()))
-    step = Step(function, batched=single is None)
-    reproduced(step, xs, ws, rows if single is None else single)
-    return step
+    return Step(function, batched=single is None, rowwise=rowwise)
 
 
 def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
     """Refuse a step that gives other results than before; under autograd, too."""
     for grad in (False, True):
         with torch.set_grad_enabled(grad):
-            after = torch.stack([step.at(0, x, w) for x, w in zip(xs, ws, strict=True)])
+            after = step.all(0, xs, ws)
         if not torch.equal(after, before):
             raise UsageError(
                 f"step gives another result when it is called again with the same x and w (difference "
-                f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness (dropout: call "
-                f".eval()), no counters, no state kept between calls"
+                f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness "
+                f"(dropout: call .eval()), no counters, no state kept between calls"
             )
 
 
@@ -149,31 +164,21 @@ def agree(a: Tensor, b: Tensor) -> bool:
     return a.shape == b.shape and bool(((a - b).abs() <= TOLERANCE * (1.0 + b.abs())).all())
 
 
-def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, Any]:
+def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, SagempError]:
     """Results ``(B, n)`` of single calls, or why there are none."""
     try:
         with torch.no_grad():
-            states = torch.stack([step.at(0, x, w) for x, w in zip(xs, ws, strict=True)])
+            states = step.all(0, xs, ws)
     except SagempError as error:
         return None, error
     finite = torch.isfinite(states).all(-1)
     if not bool(finite.all()):
         i = int(finite.long().argmin())
         return None, NonFiniteError(
-            f"step gives NaN or infinity in state {int(torch.isfinite(states[i]).long().argmin())} at x = {xs[i].tolist()}, "
-            f"w = {ws[i].tolist()} of the start and disturbance boxes"
+            f"step gives NaN or infinity in state {int(torch.isfinite(states[i]).long().argmin())} "
+            f"at x = {xs[i].tolist()}, w = {ws[i].tolist()} of the start and disturbance boxes"
         )
-    return states, None
-
-
-def _batch(function: Callable[[int, Any, Any], Any], xs: Tensor, ws: Tensor) -> Tensor | None:
-    """Results of one call on the whole batch, None if that is no batch of states."""
-    try:
-        with torch.no_grad():
-            result = function(0, xs.clone().as_subclass(_Exact), ws.clone().as_subclass(_Exact))
-        return result.detach().as_subclass(Tensor).to(torch.float64) if result.shape == xs.shape else None
-    except Exception:  # a stranger's code may raise anything
-        return None
+    return states, UsageError("it works")
 
 
 def _check_result(result: Any, shape: torch.Size) -> None:

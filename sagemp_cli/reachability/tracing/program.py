@@ -2,8 +2,8 @@
 
 Every slot holds a vector; the program runs on anything that answers torch's operations with the vector in the last
 dimension and any batch in front: plain tensors, and every propagator's sets. It needs little of them: ``v[..., index]``,
-:func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products, quotients and the functions
-that have a relaxation.
+:func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products, quotients and the
+functions that have a relaxation.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Program:
 class Recorder:
     """Writes a program down while an example is computed.
 
-    Every scalar that the example computes has a number (its id). A tensor of ids says where each of its entries comes from, so
-    that whatever only moves entries is done by torch itself, on ids.
+    Every scalar that the example computes has a number (its id). A tensor of ids says where each of its entries comes
+    from, so that whatever only moves entries is done by torch itself, on ids.
 
     Attributes:
         zero: the id of the constant 0, which is 0: operations that fill with zeros fill with it.

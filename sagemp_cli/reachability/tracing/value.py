@@ -72,7 +72,7 @@ class Traced:
         self.recorder = recorder
         self.ids = ids
 
-    # -- what a tensor says of itself ------------------------------------------------------------------------------------
+    # -- what a tensor says of itself ---------------------------------------------------------------------------------
 
     shape = property(lambda self: self.ids.shape)
     ndim = property(lambda self: self.ids.dim())
@@ -125,7 +125,7 @@ class Traced:
     def _like(self, ids: Tensor) -> Traced:
         return Traced(self.recorder, ids)
 
-    # -- entries -----------------------------------------------------------------------------------------------------------
+    # -- entries ------------------------------------------------------------------------------------------------------
 
     def __getitem__(self, index: Any) -> Traced:
         refuse_traced_index(index)
@@ -145,7 +145,7 @@ class Traced:
         self.ids.copy_(ids)
         return self
 
-    # -- what a set does not have --------------------------------------------------------------------------------------------
+    # -- what a set does not have -------------------------------------------------------------------------------------
 
     def _compared(self, *_: Any) -> Any:
         raise UnsupportedOperationError(
@@ -164,7 +164,7 @@ class Traced:
     __float__ = __int__ = __index__ = __complex__ = __array__ = __round__ = __floor__ = __ceil__ = __trunc__ = _number
     item = tolist = numpy = __format__ = _number
 
-    # -- operators -------------------------------------------------------------------------------------------------------------
+    # -- operators ----------------------------------------------------------------------------------------------------
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(torch.Tensor, name, None)
