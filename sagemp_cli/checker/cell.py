@@ -46,6 +46,8 @@ class CellClaim:
         operations: name and number of entries, in the order of evaluation.
         slope, offset, radius: ``(K, E)``.
         kept: ``(K, bytes)`` or None.
+        begin, end: steps at which the cell's set begins and ends.
+        heir_lower, heir_upper: the cell that encloses it from there on; None if it ends at K.
     """
 
     reference: np.ndarray
@@ -62,21 +64,27 @@ class CellClaim:
     offset: np.ndarray
     radius: np.ndarray
     kept: np.ndarray | None
+    begin: int
+    end: int
+    heir_lower: np.ndarray | None = None
+    heir_upper: np.ndarray | None = None
 
 
 def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
-    """Prove that every real-arithmetic rollout from the cell under every disturbance in W^K stays in the stored tube,
-    with every control within its stored bounds; the answer is empty, or says in one line what could not be proved.
+    """Prove that every real-arithmetic rollout that is in the cell at the first step stays in the stored tube up to the
+    last, under every disturbance in W^K and with every control within its stored bounds, and is in its heir then.
+
+    The answer is empty, or says in one line what could not be proved.
     """
     with ctx.workprec(BITS), np.errstate(all="ignore"):  # what overflows is found out by Zonotope
-        k = 0
+        k = claim.begin
         try:
             loop = Loop(dynamics, policy, claim.reference)
             w = balls(claim.disturbance_lower), balls(claim.disturbance_upper)
             states = Zonotope.box(claim.lower, claim.upper)
-            if not ((claim.tube_lower[0] <= claim.lower) & (claim.upper <= claim.tube_upper[0])).all():
+            if not ((claim.tube_lower[k] <= claim.lower) & (claim.upper <= claim.tube_upper[k])).all():
                 raise Unproved("the tube does not contain the cell")
-            for k in range(loop.horizon):
+            for k in range(claim.begin, claim.end):
                 step = Step(states, *w, record=_record(claim, k))
                 x = step.state()
                 u = loop.control(step, k, x)
@@ -87,6 +95,8 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
                 if claim.kept is not None:
                     states = states.reduced(_mask(claim.kept[k], states.generators.shape[1]))
                 _require_inside(states.bounds(), claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
+            if claim.heir_lower is not None and claim.heir_upper is not None:
+                _require_inside(states.bounds(), claim.heir_lower, claim.heir_upper, "state of the merged set")
         except (Unproved, UnsupportedOperationError) as e:
             return f"step {k}: {e}"
     return ""

@@ -191,9 +191,10 @@ def _geometry(
     tubes, index = document.tubes, list(dynamics.position)
     reasons, margins = {}, {}
     for r in claims:
-        own = tubes["cell_reference"] == r
+        own = (tubes["cell_reference"] == r) & (tubes["cell_begin"] == 0)  # later cells lie in the tubes of these
         lower, upper = tubes["tube_lower"][own], tubes["tube_upper"][own]
         try:
+            _require_heirs(tubes, r)
             start = tubes["start_lower"][r], tubes["start_upper"][r]
             if not covered(*start, tubes["cell_lower"][own], tubes["cell_upper"][own]):
                 raise Unproved("its cells do not cover X_I")
@@ -225,6 +226,21 @@ def _geometry(
     return reasons, margins
 
 
+def _require_heirs(tubes: Mapping[str, Any], r: int) -> None:
+    """Of merged cells: each goes over into one that begins then, within its own stored tube from there on."""
+    lower, upper, horizon = tubes["tube_lower"], tubes["tube_upper"], tubes["references"].shape[1] - 1
+    for c in np.flatnonzero(tubes["cell_reference"] == r):
+        begin, end, heir = (int(tubes[name][c]) for name in ("cell_begin", "cell_end", "cell_heir"))
+        if not 0 <= begin < end <= horizon or (heir < 0) != (end == horizon) or heir >= len(tubes["cell_reference"]):
+            raise Unproved(f"cell {c} does not last from one step to a later one, or its heir is missing")
+        if heir < 0:
+            continue
+        if tubes["cell_reference"][heir] != r or tubes["cell_begin"][heir] != end:
+            raise Unproved(f"cell {c} ends at step {end}, but its heir {heir} does not begin there")
+        if not ((lower[c, end:] <= lower[heir, end:]) & (upper[heir, end:] <= upper[c, end:])).all():
+            raise Unproved(f"the tube of cell {c} does not contain that of its heir {heir}")
+
+
 def _reach_sets(
     document: Document, dynamics: Dynamics, claims: Sequence[int], processes: int, progress: Progress
 ) -> Iterator[tuple[int, str]]:
@@ -253,7 +269,7 @@ def _prove_elsewhere(claim: CellClaim, section: Mapping[str, Any], policy: Polic
 
 def _claim(document: Document, c: int) -> CellClaim:
     tubes, found = document.tubes, document.relaxations
-    r = tubes["cell_reference"][c]
+    r, heir = tubes["cell_reference"][c], int(tubes["cell_heir"][c])
     return CellClaim(
         reference=tubes["references"][r],
         lower=tubes["cell_lower"][c],
@@ -269,6 +285,10 @@ def _claim(document: Document, c: int) -> CellClaim:
         offset=found["offset"][c],
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
+        begin=int(tubes["cell_begin"][c]),
+        end=int(tubes["cell_end"][c]),
+        heir_lower=None if heir < 0 else tubes["cell_lower"][heir],
+        heir_upper=None if heir < 0 else tubes["cell_upper"][heir],
     )
 
 

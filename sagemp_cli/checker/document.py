@@ -144,17 +144,23 @@ _SHAPES = {
     "goal_margin": "R n",
     "step": "R",
 }
+_MERGED = {"cell_begin": "C", "cell_end": "C", "cell_heir": "C"}
+"""There together or not at all."""
 _TEXTS = {"verdict": "R", "constraint": "R", "constraint_names": "constraints"}
 
 
-def _require_shapes(tubes: Mapping[str, Any], path: Path) -> None:
+def _require_shapes(tubes: dict[str, Any], path: Path) -> None:
     count, rows, n = tubes["references"].shape
     sizes = {"R": count, "K+1": rows, "K": rows - 1, "n": n, "C": len(tubes["cell_reference"])}
     sizes |= {"m": tubes["control_lower"].shape[-1], "constraints": len(tubes["constraint_names"])}
-    for name, dims in {**_SHAPES, **_TEXTS}.items():
+    if not any(name in tubes for name in _MERGED):
+        cells = len(tubes["cell_reference"])
+        tubes |= {"cell_begin": np.zeros(cells, np.int64), "cell_end": np.full(cells, rows - 1)}
+        tubes["cell_heir"] = np.full(cells, -1)
+    for name, dims in {**_SHAPES, **_TEXTS, **_MERGED}.items():
         value, wanted = tubes[name], tuple(sizes[d] for d in dims.split())
         shape = (len(value),) if name in _TEXTS else value.shape
-        integer = name in ("cell_reference", "step")
+        integer = name in ("cell_reference", "step", *_MERGED)
         kind = str if name in _TEXTS else np.int64 if integer else np.float64
         right = all(isinstance(v, str) for v in value) if name in _TEXTS else value.dtype == kind
         if shape != wanted or not right:

@@ -107,8 +107,7 @@ def execute_queries(
                 w = torch.cat([w, harm])
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)
-            cells = Box(library.cells.lower[i], library.cells.upper[i])
-            tubes = Tube(library.tube.lower[i], library.tube.upper[i])
+            cells, tubes = library.cells_of(i)
             clear = (scene.signed_distance(states[..., list(dynamics.position)]) > 0).all(-1)
             safe = clear & scene.goal.contains(states[:, -1])
             parts.append((torch.full((rollouts,), q), states, controls, w, inside_tube(states, cells, tubes), safe))

@@ -15,7 +15,11 @@ from sagemp_cli.sets import Box
 _PRODUCT = re.compile(r"^\d+(x\d+)*$")
 
 
-def parse_partitions(value: Any, uncertain_dims: int) -> list[int]:
+AUTO = "auto"
+"""The word for an adaptive partition."""
+
+
+def parse_partitions(value: Any, uncertain_dims: int, *, auto: bool = False) -> list[int] | None:
     """Cells per uncertain start dimension, from what a user writes.
 
     Args:
@@ -23,12 +27,16 @@ def parse_partitions(value: Any, uncertain_dims: int) -> list[int]:
             (4 over two dimensions is 2 x 2, 6 is 3 x 2, 5 is 5 x 1), or counts per uncertain dimension
             (``"2x2"`` or ``[2, 2]``).
         uncertain_dims: number of start dimensions of positive width.
+        auto: whether ``"auto"`` is allowed, which gives None: no counts, the partition is adaptive.
 
     Raises:
         ConfigError: anything else, e.g. 0 or "4x".
     """
-    allowed = (
-        f"a positive number of cells in all, or {uncertain_dims} counts such as {'x'.join(['2'] * uncertain_dims)}"
+    if auto and isinstance(value, str) and value.strip() == AUTO:
+        return None
+    example = f"{uncertain_dims} counts such as {'x'.join(['2'] * uncertain_dims)}"
+    allowed = f"a positive number of cells in all, {example}, or auto" if auto else (
+        f"a positive number of cells in all, or {example}"
     )
     counts: list[int] = []
     if isinstance(value, str) and _PRODUCT.match(value.strip()):

@@ -59,14 +59,6 @@ class Recording:
         """The same for some of the first batch dimension."""
         return self._map(lambda t: t[index])
 
-    def unflatten(self, sizes: tuple[int, ...]) -> Recording:
-        """The first batch dimension split into several."""
-        return self._map(lambda t: t.unflatten(0, sizes))
-
-    def flatten(self) -> Recording:
-        """The first two batch dimensions as one."""
-        return self._map(lambda t: t.flatten(0, 1))
-
     @staticmethod
     def join(parts: Sequence[Recording | None]) -> Recording | None:
         """Recordings of the same loop, one after the other; None if one of them is missing or differs in structure."""

@@ -14,19 +14,18 @@ from sagemp_cli.storage import Relaxations, Tubes
 
 
 def tubes_record(v: Verification) -> Tubes:
-    """A verification as stored: the cells of all references in one list."""
-    count, cells = v.cells.lower.shape[:2]
+    """A verification as stored."""
     return Tubes(
         references=v.references.numpy(),
         start_lower=v.start.lower.numpy(),
         start_upper=v.start.upper.numpy(),
         disturbance_lower=v.disturbance.lower.numpy(),
         disturbance_upper=v.disturbance.upper.numpy(),
-        cell_reference=np.repeat(np.arange(count), cells),
-        cell_lower=v.cells.lower.flatten(0, 1).numpy(),
-        cell_upper=v.cells.upper.flatten(0, 1).numpy(),
-        tube_lower=v.tube.lower.flatten(0, 1).numpy(),
-        tube_upper=v.tube.upper.flatten(0, 1).numpy(),
+        cell_reference=v.cell_reference.numpy(),
+        cell_lower=v.cells.lower.numpy(),
+        cell_upper=v.cells.upper.numpy(),
+        tube_lower=v.tube.lower.numpy(),
+        tube_upper=v.tube.upper.numpy(),
         control_lower=v.control_lower.numpy(),
         control_upper=v.control_upper.numpy(),
         verdict=tuple(str(x.outcome) for x in v.verdicts),
@@ -38,7 +37,7 @@ def tubes_record(v: Verification) -> Tubes:
         seconds=v.seconds.numpy(),
         propagator=v.propagator,
         rigorous=v.rigorous,
-        relaxations=None if v.recording is None else _relaxations(v.recording.flatten()),
+        relaxations=None if v.recording is None else _relaxations(v.recording),
     )
 
 
@@ -53,7 +52,7 @@ def _relaxations(recording: Recording) -> Relaxations:
     )
 
 
-def _recording(record: Relaxations, sizes: tuple[int, int]) -> Recording:
+def _recording(record: Relaxations) -> Recording:
     return Recording(
         record.operations,
         tuple(record.widths.tolist()),
@@ -61,33 +60,29 @@ def _recording(record: Relaxations, sizes: tuple[int, int]) -> Recording:
         torch.from_numpy(record.offset),
         torch.from_numpy(record.radius),
         None if record.kept is None else torch.from_numpy(record.kept),
-    ).unflatten(sizes)
+    )
 
 
 def verification_of(record: Tubes, where: str) -> Verification:
     """A stored record as a verification; ``where`` names the file in messages.
 
     Raises:
-        ArtifactError: the cells are not sorted by reference with equally many each, or a verdict is unknown.
+        ArtifactError: the cells are not sorted by reference, a reference has none, or a verdict is unknown.
     """
-    count = len(record.references)
-    owner = record.cell_reference
-    cells = len(owner) // max(count, 1)
-    if count == 0 or cells * count != len(owner) or not np.array_equal(owner, np.repeat(np.arange(count), cells)):
-        raise ArtifactError(f"{where}: /data/tubes/cell_reference must list equally many cells of each reference")
+    count, owner = len(record.references), record.cell_reference
+    if count == 0 or (np.diff(owner) < 0).any() or not np.array_equal(np.unique(owner), np.arange(count)):
+        raise ArtifactError(f"{where}: /data/tubes/cell_reference must list the cells of each of {count} references in turn")
     unknown = [x for x in record.verdict if x not in list(Outcome)]
     if unknown:
         raise ArtifactError(f"{where}: /data/tubes/verdict holds '{unknown[0]}'; known: {', '.join(Outcome)}")
-
-    def per_cell(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values).unflatten(0, (count, cells))
 
     return Verification(
         references=torch.from_numpy(record.references),
         start=Box(torch.from_numpy(record.start_lower), torch.from_numpy(record.start_upper)),
         disturbance=Box(torch.from_numpy(record.disturbance_lower), torch.from_numpy(record.disturbance_upper)),
-        cells=Box(per_cell(record.cell_lower), per_cell(record.cell_upper)),
-        tube=Tube(per_cell(record.tube_lower), per_cell(record.tube_upper)),
+        cell_reference=torch.from_numpy(owner),
+        cells=Box(torch.from_numpy(record.cell_lower), torch.from_numpy(record.cell_upper)),
+        tube=Tube(torch.from_numpy(record.tube_lower), torch.from_numpy(record.tube_upper)),
         control_lower=torch.from_numpy(record.control_lower),
         control_upper=torch.from_numpy(record.control_upper),
         verdicts=tuple(
@@ -100,5 +95,5 @@ def verification_of(record: Tubes, where: str) -> Verification:
         seconds=torch.from_numpy(record.seconds),
         propagator=record.propagator,
         rigorous=bool(record.rigorous),
-        recording=None if record.relaxations is None else _recording(record.relaxations, (count, cells)),
+        recording=None if record.relaxations is None else _recording(record.relaxations),
     )

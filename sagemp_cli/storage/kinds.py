@@ -109,6 +109,15 @@ class Tubes:
     propagator: str = scalar("propagator that made the tubes")
     rigorous: bool = scalar("whether rounding is included in the tubes")
     relaxations: Relaxations | None = group(Relaxations, "what the proof can be done again from", optional=True)
+    cell_begin: np.ndarray | None = array(
+        "cells", "step at which each cell's set begins (0: part of X_I)", dtype="int64", optional=True
+    )
+    cell_end: np.ndarray | None = array(
+        "cells", "step at which it goes over into its heir (K: never)", dtype="int64", optional=True
+    )
+    cell_heir: np.ndarray | None = array(
+        "cells", "index of the cell that begins there and encloses it (-1: none)", dtype="int64", optional=True
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,8 @@ from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.verdict import Outcome, Verdict
+from sagemp_cli.sets import Box
+from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Counterexample
 
 
@@ -200,3 +202,89 @@ def test_the_command_says_what_was_proved(certificate, tmp_path):
     assert "reference 0: proved, keeps 0.467 m from disc" in result.output
     as_json = run(tmp_path / "certificate.h5", "--json")
     assert as_json.exit_code == 0 and '"answer": "VERIFIED"' in as_json.output
+
+
+def merged(case, path, *, at=4, shrink=0.0, gap=0.0):
+    """The two cells of a case go on from step ``at`` as one box around both."""
+    found = case.verification
+    tracker, dynamics, w = case.tracker, case.problem.dynamics, case.problem.disturbance
+    hull = Box(found.tube.lower[:2, at].amin(0) + shrink, found.tube.upper[:2, at].amax(0) - shrink)
+    loop = ClosedLoop(dynamics, tracker, found.references[0])
+    run = Affine().run(loop, Box(hull.lower, hull.upper), w, first=at)
+    record = tubes_record(found)
+    late = record.relaxations.slope.shape[1] - at
+
+    def joined(values, new):
+        return np.concatenate([values, new[None].astype(values.dtype)])
+
+    def with_heir(values, late_rows):
+        out = joined(values, np.zeros_like(values[0]))
+        out[2, -late:] = late_rows
+        return out
+
+    recording = run.recording()
+    relaxations = dataclasses.replace(
+        record.relaxations,
+        **{n: with_heir(getattr(record.relaxations, n), getattr(recording, n).numpy()) for n in BANDS},
+    )
+    lower, upper = (joined(v, v[0]) for v in (record.tube_lower, record.tube_upper))
+    lower[2, at:], upper[2, at:] = run.tube.lower.numpy(), run.tube.upper.numpy()
+    lower[2, :at], upper[2, :at] = lower[:2, :at].min(0), upper[:2, :at].max(0)
+    for c in range(2):
+        lower[c, at:] = np.minimum(lower[c, at:], lower[2, at:] + gap)
+        upper[c, at:] = np.maximum(upper[c, at:], upper[2, at:])
+    controls = record.control_lower - 1.0, record.control_upper + 1.0
+    tubes = dataclasses.replace(
+        record,
+        cell_reference=np.zeros(3, dtype=np.int64),
+        cell_lower=joined(record.cell_lower, hull.lower.numpy()),
+        cell_upper=joined(record.cell_upper, hull.upper.numpy()),
+        tube_lower=lower,
+        tube_upper=upper,
+        control_lower=controls[0],
+        control_upper=controls[1],
+        clearance=record.clearance - 0.1,
+        goal_margin=record.goal_margin - 0.1,
+        relaxations=relaxations,
+        cell_begin=np.array([0, 0, at]),
+        cell_end=np.array([at, at, 8]),
+        cell_heir=np.array([2, 2, -1]),
+    )
+    return case.write(path, tubes=tubes)
+
+
+BANDS = ("slope", "offset", "radius")
+
+
+def test_cells_may_go_over_into_one_that_encloses_them(case, tmp_path):
+    report = check(merged(case, tmp_path / "certificate.h5"))
+    assert report.answer == "VERIFIED", report.findings
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"cell_heir": [2, 1, -1]}, "cell 1 ends at step 4, but its heir 1 does not begin there"),
+        ({"cell_heir": [-1, 2, -1]}, "cell 0 does not last from one step to a later one, or its heir is missing"),
+        ({"cell_begin": [0, 0, 5]}, "cell 0 ends at step 4, but its heir 2 does not begin there"),
+        ({"cell_begin": [0, 4, 4]}, "does not last"),
+        ({"cell_begin": [0, 1, 4]}, "its cells do not cover X_I"),
+        ({"cell_end": [4, 4, 7]}, "cell 2 does not last"),
+    ],
+)
+def test_a_record_of_merging_that_makes_no_sense_proves_nothing(change, why, case, mutate, tmp_path):
+    path = merged(case, tmp_path / "certificate.h5")
+
+    def edit(file):
+        for name, values in change.items():
+            file["data/tubes"][name][...] = values
+
+    report = check(mutate(path, tmp_path / "mutant.h5", edit))
+    assert report.answer == "UNKNOWN" and why in report.findings[0].reason
+
+
+def test_a_merged_set_must_enclose_what_it_replaces(case, tmp_path):
+    small = check(merged(case, tmp_path / "small.h5", shrink=1e-6))
+    assert small.answer == "UNKNOWN" and "state of the merged set 0 is only proved to lie" in small.findings[0].reason
+    gap = check(merged(case, tmp_path / "gap.h5", gap=1e-6))
+    assert gap.answer == "UNKNOWN" and "does not contain that of its heir 2" in gap.findings[0].reason

@@ -1,0 +1,26 @@
+"""Every robot model, built from its config."""
+
+from __future__ import annotations
+
+import pytest
+
+from sagemp_cli.binding import build
+from sagemp_cli.config import compose, options_of
+from sagemp_cli.dynamics import Dynamics
+
+ROBOTS = options_of("dynamics")
+
+
+def robot(name: str, **changes) -> Dynamics:
+    return build(compose([f"dynamics={name}"])["dynamics"] | changes, "dynamics")
+
+
+@pytest.fixture(params=ROBOTS)
+def any_robot(request) -> Dynamics:
+    return robot(request.param)
+
+
+@pytest.fixture
+def make_robot():
+    """``make_robot(name, **changes)``: a robot of the config, with some options changed."""
+    return robot
