@@ -25,7 +25,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_thread_per_child() -> Iterator[None]:
-    """Processes that are started meanwhile get one thread: two with default threads on two cores are many times slower."""
+    """Processes started meanwhile get one thread: two with default threads on two cores are many times slower."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:

@@ -22,6 +22,7 @@ RANK = {
     "trackers": 5,
     "closed_loop": 4,
     "training": 4,
+    "workers": 4,
     "checkpoint": 3,
     "dynamics": 3,
     "scenes": 3,

@@ -38,15 +38,12 @@ class AffineRun:
         bands: per step, the bands used, in the order of evaluation.
         kept: per step, the mask of the generators kept ``(*batch, M)``; empty if none were ever dropped.
         steps: per step, the form of the next state (and in its frame, what went into it); empty unless asked for.
-        center, generators: the zonotope after the last step.
     """
 
     tube: Tube
     bands: list[list[tuple[str, Band]]] = field(repr=False)
     kept: list[Tensor] = field(default_factory=list, repr=False)
     steps: list[AffineForm] = field(default_factory=list, repr=False)
-    center: Tensor | None = field(default=None, repr=False)
-    generators: Tensor | None = field(default=None, repr=False)
 
     def recording(self) -> Recording:
         """What a certificate keeps of the run."""
@@ -95,8 +92,6 @@ class Affine:
         disturbance: Box,
         *,
         horizon: int | None = None,
-        first: int = 0,
-        before: AffineRun | None = None,
         keep_steps: bool = False,
         hints: Sequence[Hints] | None = None,
     ) -> AffineRun:
@@ -104,25 +99,18 @@ class Affine:
 
         Args:
             loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
-            horizon: the step after the last one; the loop's by default.
-            first: the first step.
-            before: the run that ended there; the start box is only used without one.
+            horizon: steps; the loop's by default.
             keep_steps: keep every step's form, for a backward pass.
             hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
         """
-        if before is None:
-            center, reach = start.center, start.radius
-            generators = torch.diag_embed(reach)
-            lowers, uppers = [start.lower], [start.upper]
-        else:
-            center, generators = before.center, before.generators
-            reach = _reach(generators)
-            lowers, uppers = [before.tube.lower[..., -1, :]], [before.tube.upper[..., -1, :]]
+        center, reach = start.center, start.radius
+        generators = torch.diag_embed(reach)
+        lowers, uppers = [start.lower], [start.upper]
         w_center, w_radius = disturbance.center, disturbance.radius
         bands, masks, kept_steps = [], [], []
         steps = loop.horizon if horizon is None else horizon
-        for k in range(first, steps):
-            frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k - first])
+        for k in range(steps):
+            frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
             after = loop.step(k, frame.state(center), frame.disturbance(w_center))
             bands.append(frame.bands)
             if keep_steps:
@@ -131,14 +119,15 @@ class Affine:
             if self.symbols is not None:
                 generators, mask = reduce_generators(generators, self.symbols)
                 masks.append(mask)
-            reach = _reach(generators)
+            growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
+            reach = generators.abs().sum(-1) * growth
             spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
             lowers.append(center - spread)
             uppers.append(center + spread)
             if not bool(torch.isfinite(reach).all()):
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
         tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
-        return AffineRun(tube, bands, masks, kept_steps, center, generators)
+        return AffineRun(tube, bands, masks, kept_steps)
 
 
 @dataclass(frozen=True)
@@ -165,11 +154,6 @@ class _Watched:
 def _advance(after: AffineForm) -> tuple[Tensor, Tensor]:
     """Centre and generators of the next state set from the step's affine form."""
     return after.center, torch.cat([after.spread(), torch.diag_embed(after.rounding())], dim=-1)
-
-
-def _reach(generators: Tensor) -> Tensor:
-    """Radius of the zonotope's box, rounded up."""
-    return generators.abs().sum(-1) * (1.0 + 2 * (generators.shape[-1] + 8) * UNIT)
 
 
 def _overflow(lowers, uppers, center, generators, reach):

@@ -329,7 +329,8 @@ def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
         value = constant(a.frame, b, a.center)
         shape = _broadcast(a.shape, value.shape)
         center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
-        return AffineForm(a.frame, center + value, coefficients, magnitude + value.abs(), a.error + UNIT)
+        # Two units: the second is for the rounding of alpha times the constant.
+        return AffineForm(a.frame, center + value, coefficients, magnitude + value.abs(), a.error + 2 * UNIT)
     shape = _broadcast(a.shape, b.shape)
     size = max(a.coefficients.shape[0], b.coefficients.shape[0])
     (c1, g1, m1), (c2, g2, m2) = _expand(a, shape, size), _expand(b, shape, size)

@@ -63,18 +63,18 @@ def reach(
 ) -> Tube:
     """Tube ``(K+1, n)`` around all rollouts ``x_{k+1} = step(x_k, w_k)`` with ``x_0`` and ``w_k`` in their boxes.
 
-    ``step`` is any torch code, a neural network with float32 weights included. It is called on a few tensors, to see what
-    shapes it wants and that it is a function of its arguments, and recorded once on values that refuse what cannot be
-    bounded. The propagator gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants that meet
-    ``x`` or ``w`` taken as the exact numbers they are; what the step computes from constants alone is taken as torch
-    computes it. A simulated rollout differs by its own rounding (noticeably in float32), which is not enclosed.
+    ``step`` is any torch code, a neural network with float32 weights included. It is called on a few tensors, to see
+    what shapes it wants and that it is a function of its arguments, and recorded once on values that refuse what cannot
+    be bounded. The propagator gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants
+    that meet ``x`` or ``w`` taken as the exact numbers they are; what the step computes from constants alone is taken
+    as torch computes it. A simulated rollout differs by its own rounding (noticeably in float32), which is not enclosed.
 
-    Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness). A
-    step whose calls differ, or that leaves the recorded program on a simulated rollout, is refused.
+    Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness).
+    A step whose calls differ, or that leaves the recorded program on a simulated rollout, is refused.
 
     Args:
-        step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it returns
-            the next state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose
+        step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it
+            returns the next state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose
             ``step(k, x, w)`` may depend on the step number.
         start: box ``(n,)`` of starts; sides of width zero are allowed.
         disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n.
@@ -197,8 +197,8 @@ def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, vary
             loop.step(k, states[known, k], disturbances[known, k]), states[known, k + 1]
         ):
             raise UsageError(
-                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did when "
-                f"it was recorded; it must be a function of x and w only, in torch operations"
+                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did "
+                f"when it was recorded; it must be a function of x and w only, in torch operations"
             )
     return loop
 

@@ -1,8 +1,8 @@
 """CROWN: linear bounds of every step's state, taken back to the start box.
 
-The relaxations are those of one forward affine pass (:mod:`sagemp_cli.reachability.affine`), which bounds the inputs of all
-operations; then one backward sweep (:mod:`sagemp_cli.reachability.backward`) serves all steps. Unlike CROWN on the unrolled graph
-it does not walk back for every intermediate bound, which costs K^2 visits of every operation.
+The relaxations are those of one forward affine pass (:mod:`sagemp_cli.reachability.affine`), which bounds the inputs of
+all operations; then one backward sweep (:mod:`sagemp_cli.reachability.backward`) serves all steps. Unlike CROWN on the
+unrolled graph it does not walk back for every intermediate bound, which costs K^2 visits of every operation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine import Affine, AffineRun
-from sagemp_cli.reachability.backward import Step, backward, compiled
+from sagemp_cli.reachability.affine_form import Hints, Relaxed
+from sagemp_cli.reachability.backward import backward, compiled
 from sagemp_cli.reachability.batch import batched_start
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.relaxations.band import UNIT
@@ -27,8 +28,8 @@ from sagemp_cli.sets import Box, Tube
 class Crown:
     """Backward linear bounds, rounding included.
 
-    Memory per cell: of the order of ``K (v^2 + v n)`` numbers for the steps, with v variables a step (states, disturbances, one
-    per relaxed entry), plus ``rows`` times 5 v for the sweep.
+    Memory per cell, in float64 numbers: of the order of ``K (v^2 + n M)`` for the recorded steps, with v variables a step
+    (states, disturbances, one per relaxed entry) and M generators, and ``5 v rows`` for the sweep.
 
     Attributes:
         symbols: most generators that the forward pass keeps between steps (None: all).
@@ -36,7 +37,7 @@ class Crown:
     """
 
     symbols: int | None = None
-    rows: int = 4096
+    rows: int = 8192
     name: ClassVar[str] = "crown"
     rigorous: ClassVar[bool] = True
 
@@ -50,34 +51,44 @@ class Crown:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
         start = batched_start(loop, start, disturbance)
         run = Affine(symbols=self.symbols).run(loop, start, disturbance, keep_steps=True)
-        return backward_tube(compiled(run.steps), [run], start, rows=self.rows)
+        return taken_back(run, start, rows=self.rows)[0]
 
 
-def backward_tube(steps: list[Step], runs: list[AffineRun], start: Box, *, rows: int) -> Tube:
-    """The tube of a backward sweep over the steps of runs that follow one another.
+def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -> tuple[Tube, list[Hints]]:
+    """The tube of backward sweeps over a run's steps; and bounds of all operations' inputs, if asked for.
 
     Args:
-        steps: all steps, ready for rows.
-        runs: whose centres the rows are relative to.
-        start: in the runs' batch shape.
-        rows: most rows at once; at least one step's are taken.
+        run: with its steps kept.
+        start: in the run's batch shape.
+        rows: most rows at once for one cell; at least one step's are taken.
+        inputs: whether the operations' inputs are bounded too.
     """
-    centers = torch.stack([after.center for run in runs for after in run.steps], dim=-2)
-    size = max(1, rows // (2 * start.dim))
-    sides: tuple[list[Tensor], list[Tensor]] = ([], [])
+    steps = compiled(run.steps)
+    joining = 2 * start.dim
+    if inputs:
+        joining += max(sum(r.input.shape[-2] for r in s.replacements if r.input is not None) for s in steps)
+    size = max(1, rows // joining)
+    lowers, uppers, hints = [start.lower[..., None, :]], [start.upper[..., None, :]], []
     for first in range(0, len(steps), size):
-        targets = range(first, min(first + size, len(steps)))
-        bounds = backward(steps, start.radius, targets=targets)
-        for side, found in zip(sides, bounds.state, strict=True):
-            side.append(found)
-    low, high = (torch.cat(side, dim=-2) for side in sides)
-    lower, upper = placed(centers, low, high)
-    return Tube(
-        torch.cat([start.lower[..., None, :], lower], dim=-2), torch.cat([start.upper[..., None, :], upper], dim=-2)
-    )
+        some = run.steps[first : first + size]
+        found = backward(steps, start.radius, targets=range(first, first + len(some)), inputs=inputs)
+        lower, upper = _placed(torch.stack([after.center for after in some], dim=-2), *found.state)
+        lowers.append(lower)
+        uppers.append(upper)
+        for after, bounds in zip(some, found.inputs, strict=True):
+            hints.append([_hint(*pair) for pair in zip(after.frame.relaxations, bounds, strict=True)])
+    return Tube(torch.cat(lowers, dim=-2), torch.cat(uppers, dim=-2)), hints
 
 
-def placed(center: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+def _hint(operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
+    """Bounds of an operation's input in its own shape."""
+    if bounds is None:
+        return None
+    low, high = (side.reshape(operation.center.shape) for side in bounds)
+    return _placed(operation.center, low, high)
+
+
+def _placed(center: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of deviations as bounds of values, rounded outwards; infinite where there is no centre."""
     lower = center + low - (center.abs() + low.abs()) * (2 * UNIT)
     upper = center + high + (center.abs() + high.abs()) * (2 * UNIT)

@@ -35,8 +35,10 @@ def parse_partitions(value: Any, uncertain_dims: int, *, auto: bool = False) -> 
     if auto and isinstance(value, str) and value.strip() == AUTO:
         return None
     example = f"{uncertain_dims} counts such as {'x'.join(['2'] * uncertain_dims)}"
-    allowed = f"a positive number of cells in all, {example}, or auto" if auto else (
-        f"a positive number of cells in all, or {example}"
+    allowed = (
+        f"a positive number of cells in all, {example}, or auto"
+        if auto
+        else (f"a positive number of cells in all, or {example}")
     )
     counts: list[int] = []
     if isinstance(value, str) and _PRODUCT.match(value.strip()):

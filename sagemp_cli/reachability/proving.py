@@ -44,6 +44,24 @@ class Chunk:
     def __len__(self) -> int:
         return len(self.cell_reference)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it but the index as arrays by name, to send it elsewhere."""
+        found = {
+            "cell_reference": self.cell_reference,
+            "references": self.references,
+            "lower": self.cells.lower,
+            "upper": self.cells.upper,
+        }
+        return {name: tensor.numpy() for name, tensor in found.items()}
+
+    @classmethod
+    def of(cls, index: int, arrays: Mapping[str, np.ndarray]) -> Chunk:
+        """Back from :meth:`arrays`."""
+        owner, references, lower, upper = (
+            torch.from_numpy(arrays[name].copy()) for name in ("cell_reference", "references", "lower", "upper")
+        )
+        return cls(index, owner, references, Box(lower, upper))
+
 
 @dataclass(frozen=True)
 class CellTubes:

@@ -133,8 +133,8 @@ def shortfall(tube: Tube, scene: Scene, *, position: Sequence[int]) -> tuple[Ten
     """How far each of the tubes ``(C, K+1, n)`` is from being SAFE by itself.
 
     Returns:
-        Whether it is SAFE, as in :func:`assess`, ``(C,)``; and a measure of what is missing, 0 if nothing is, ``(C,)``: the
-        sum over all steps, constraints and faces of the goal of ``log(1 + depth)``. It guides, it proves nothing.
+        Whether it is SAFE, as in :func:`assess`, ``(C,)``; and a measure of what is missing, 0 if nothing is, ``(C,)``:
+        the sum over all steps, constraints and faces of the goal of ``log(1 + depth)``. It guides, it proves nothing.
     """
     found = _measure(tube, scene, position)
     safe = found.finite.flatten(1).all(1) & (found.clearances > 0).flatten(1).all(1) & found.reaches

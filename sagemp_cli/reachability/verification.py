@@ -89,11 +89,12 @@ class Verification:
         i = torch.as_tensor(list(indices), dtype=torch.int64)
         own = [torch.nonzero(self.cell_reference == r).flatten() for r in i]
         cells = torch.cat([torch.zeros(0, dtype=torch.int64), *own])
+        sizes = torch.tensor([len(c) for c in own], dtype=torch.int64)
         return dataclasses.replace(
             self,
             references=self.references[i],
             start=Box(self.start.lower[i], self.start.upper[i]),
-            cell_reference=torch.arange(len(i)).repeat_interleave(torch.tensor([len(c) for c in own], dtype=torch.int64)),
+            cell_reference=torch.arange(len(i)).repeat_interleave(sizes),
             cells=Box(self.cells.lower[cells], self.cells.upper[cells]),
             tube=Tube(self.tube.lower[cells], self.tube.upper[cells]),
             control_lower=self.control_lower[i],
@@ -264,7 +265,7 @@ class _Work:
 
 
 def _breaks(prover: CellProver, scene: Scene, references: Tensor, x: Tensor) -> Tensor:
-    """Whether the rollouts from ``x (B, n)`` without extreme disturbances leave the safe set or miss the goal, ``(B,)``."""
+    """Whether rollouts from ``x (B, n)`` under the middle disturbance leave the safe set or miss the goal, ``(B,)``."""
     loop = ClosedLoop(prover.dynamics, prover.tracker, references)
     w = prover.disturbance.center.expand(len(x), loop.horizon, -1)
     with torch.no_grad():

@@ -71,7 +71,9 @@ def verification_of(record: Tubes, where: str) -> Verification:
     """
     count, owner = len(record.references), record.cell_reference
     if count == 0 or (np.diff(owner) < 0).any() or not np.array_equal(np.unique(owner), np.arange(count)):
-        raise ArtifactError(f"{where}: /data/tubes/cell_reference must list the cells of each of {count} references in turn")
+        raise ArtifactError(
+            f"{where}: /data/tubes/cell_reference must list the cells of each of {count} references in turn"
+        )
     unknown = [x for x in record.verdict if x not in list(Outcome)]
     if unknown:
         raise ArtifactError(f"{where}: /data/tubes/verdict holds '{unknown[0]}'; known: {', '.join(Outcome)}")

@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.binding import target_class
-from sagemp_cli.checker.check import Report, check
 from sagemp_cli.models import weights_of
 from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.verdict import answer_of
-from sagemp_cli.reachability.verification import Verification, verify_references
+from sagemp_cli.reachability.verification import verify_references
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.stages.problem import Problem
 from sagemp_cli.stages.tubes import tubes_record
-from sagemp_cli.storage import Certificate, Counterexample, Header, write_artifact
+from sagemp_cli.storage import Certificate, Header, Tubes, write_artifact
 from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
 from sagemp_cli.trackers.policy import Tracker
 
@@ -85,17 +82,17 @@ class Case:
     problem: Problem
     tracker: Tracker
     arguments: dict[str, Any]
-    verification: Verification
+    tubes: Tubes
 
     def write(self, path: Path, **record: Any) -> Path:
         """The certificate as a file."""
         values: dict[str, Any] = {
-            "tubes": tubes_record(self.verification),
+            "tubes": self.tubes,
             "tracker": weights_of(self.tracker),
             "tracker_arguments": json.dumps(self.arguments),
             "counterexamples": (),
             "falsifier_rollouts": 0,
-            "verdict": str(answer_of(self.verification.verdicts)),
+            "verdict": "VERIFIED" if set(self.tubes.verdict) == {"SAFE"} else "UNKNOWN",
         }
         header = Header(stage="verify", experiment=self.config["name"], config=self.config)
         return write_artifact(path, Certificate(**(values | record)), header, overwrite=True)
@@ -131,7 +128,7 @@ def make_case(
         disturbance=problem.disturbance,
         counts=list(counts),
     )
-    return Case(config, problem, tracker, arguments, verification)
+    return Case(config, problem, tracker, arguments, tubes_record(verification))
 
 
 @pytest.fixture(scope="session")
@@ -156,11 +153,6 @@ def mutant(source: Path, path: Path, change: Callable[[h5py.File], None], *, reh
     return path
 
 
-def verdict_of(path: Path) -> Report:
-    """What the checker says."""
-    return check(path)
-
-
 @pytest.fixture
 def mutate() -> Callable[..., Path]:
     """:func:`mutant`."""
@@ -171,9 +163,3 @@ def mutate() -> Callable[..., Path]:
 def make() -> Callable[..., Case]:
     """:func:`make_case`."""
     return make_case
-
-
-def counterexample_of(case: Case, states: np.ndarray, w: np.ndarray, **fields: Any) -> Counterexample:
-    """A record of a violation."""
-    values = {"reference": 0, "kind": "collision", "step": len(w), "constraint": "disc", "depth": 0.1}
-    return Counterexample(states=states, disturbances=w, **(values | fields))

@@ -12,10 +12,9 @@ from sagemp_cli.cli.main import app
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.verdict import Outcome, Verdict
 from sagemp_cli.sets import Box
-from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Counterexample
+from sagemp_cli.storage.content import content_hash
 
 
 def run(*arguments):
@@ -31,7 +30,7 @@ def test_what_the_affine_propagator_certifies_is_proved_again(robot, symbols, ma
     assert [f.proved for f in report.findings] == [True]
     assert report.cells == 2 and report.horizon == 6
     # What is proved here is at least what the certificate says.
-    stored = dict(zip(case.verification.constraint_names, case.verification.clearance[0].tolist(), strict=True))
+    stored = dict(zip(case.tubes.constraint_names, case.tubes.clearance[0].tolist(), strict=True))
     assert all(stored[name] <= value + 1e-12 for name, value in report.findings[0].clearance.items())
 
 
@@ -62,8 +61,8 @@ def test_what_the_file_does_not_claim_is_not_proved(make, tmp_path):
 
 
 def test_tubes_without_relaxations_cannot_be_checked(case, tmp_path):
-    bare = dataclasses.replace(case.verification, recording=None, propagator="auto_lirpa", rigorous=False)
-    path = dataclasses.replace(case, verification=bare).write(tmp_path / "certificate.h5")
+    bare = dataclasses.replace(case.tubes, relaxations=None, propagator="auto_lirpa", rigorous=False)
+    path = case.write(tmp_path / "certificate.h5", tubes=bare)
     report = check(path)
     assert report.answer == "UNKNOWN"
     assert report.problems == (
@@ -74,16 +73,15 @@ def test_tubes_without_relaxations_cannot_be_checked(case, tmp_path):
 
 def falsified(case, path, *, depth_step=8):
     """A certificate with a rollout through the disc."""
-    loop = ClosedLoop(case.problem.dynamics, case.tracker, case.verification.references[0])
+    loop = ClosedLoop(case.problem.dynamics, case.tracker, torch.from_numpy(case.tubes.references[0]))
     w = torch.zeros(8, 4, dtype=torch.float64)
     states, _ = loop.rollout(case.problem.start.center, w)
-    unsafe = dataclasses.replace(case.verification, verdicts=(Verdict(Outcome.UNSAFE, depth_step, "disc"),))
+    unsafe = dataclasses.replace(case.tubes, verdict=("UNSAFE",), step=np.array([depth_step]), constraint=("disc",))
     example = Counterexample(
         reference=0, kind="collision", step=depth_step, constraint="disc", depth=0.1, states=states.detach().numpy(),
         disturbances=w.numpy(),
     )  # fmt: skip
-    changed = dataclasses.replace(case, verification=unsafe)
-    return changed.write(path, verdict="FALSIFIED", counterexamples=(example,))
+    return case.write(path, tubes=unsafe, verdict="FALSIFIED", counterexamples=(example,))
 
 
 def test_a_counterexample_is_replayed_and_proved(make, tmp_path):
@@ -107,41 +105,48 @@ def test_a_counterexample_that_violates_nothing_or_cheats_proves_nothing(make, m
         assert check(mutate(path, tmp_path / "mutant.h5", change)).answer == "UNKNOWN"
 
 
-def test_the_hash_alone_rejects_any_change(certificate, mutate, tmp_path):
-    datasets, attributes = [], []
-    with h5py.File(certificate) as file:
-        file.visititems(lambda name, node: datasets.append(name) if isinstance(node, h5py.Dataset) else None)
-        attributes += [("/", key) for key in file.attrs if not key.startswith(("schema", "content"))]
-        file.visititems(lambda name, node: attributes.extend((name, key) for key in node.attrs))
-    attributes = [(name, key) for name, key in attributes if not key.startswith("DIMENSION")]
-    assert len(datasets) > 25 and len(attributes) > 30
-
-    def of_dataset(name):
-        def change(file):
-            dataset = file[name]
-            if h5py.check_string_dtype(dataset.dtype):
-                dataset[...] = "x"
-            elif dataset.dtype.kind == "f":
-                flat = dataset[()].copy()
-                flat.flat[0] = np.nextafter(flat.flat[0], 9)
-                dataset[...] = flat
+def changed_somewhere(file):
+    """Changes one thing after the other, and says where."""
+    nodes = [("/", file)]
+    file.visititems(lambda name, node: nodes.append((name, node)))
+    for name, node in nodes:
+        for key, value in list(node.attrs.items()):
+            if not key.startswith(("DIMENSION", "content_sha256")):
+                node.attrs[key] = value + "x" if isinstance(value, str) else value + 1
+                yield f"{name}@{key}"
+                node.attrs[key] = value
+        if isinstance(node, h5py.Dataset) and node.size:
+            value = node[()]
+            if h5py.check_string_dtype(node.dtype):
+                node[...] = "x"
+            elif node.dtype.kind == "f":
+                node[...] = np.nextafter(value, 9)
             else:
-                dataset[...] = dataset[()] + 1
+                node[...] = value + 1
+            yield name
+            node[...] = value
 
-        return change
 
-    def of_attribute(name, key):
-        def change(file):
-            value = file[name].attrs[key]
-            file[name].attrs[key] = value + "x" if isinstance(value, str) else value + 1
+def test_the_hash_changes_with_anything_in_the_file(certificate, tmp_path):
+    path = tmp_path / "copy.h5"
+    shutil.copy(certificate, path)
+    with h5py.File(path, "r+", driver="core", backing_store=False) as file:
+        before, different = content_hash(file), {}
+        for place in changed_somewhere(file):
+            different[place] = content_hash(file) != before
+        assert content_hash(file) == before == file.attrs["content_sha256"]
+    assert len(different) > 80 and all(different.values())
 
-        return change
 
-    changes = [of_dataset(name) for name in datasets] + [of_attribute(*place) for place in attributes]
-    for change in changes:
-        path = mutate(certificate, tmp_path / "mutant.h5", change, rehash=False)
-        with pytest.raises(ArtifactError, match=r"the content was changed after it was written \(its hash differs\)"):
-            check(path)
+@pytest.mark.parametrize(
+    "name", ["config", "data/tubes/tube_lower", "data/tubes/relaxations/slope", "data/tracker/layers.0.bias"]
+)
+def test_the_hash_alone_rejects_a_change(name, certificate, mutate, tmp_path):
+    def change(file):
+        file[name][...] = "x" if name == "config" else np.nextafter(file[name][()], 9)
+
+    with pytest.raises(ArtifactError, match=r"the content was changed after it was written \(its hash differs\)"):
+        check(mutate(certificate, tmp_path / "mutant.h5", change, rehash=False))
 
 
 def test_a_hash_does_not_depend_on_how_the_file_is_stored(certificate, mutate, tmp_path):
@@ -204,14 +209,32 @@ def test_the_command_says_what_was_proved(certificate, tmp_path):
     assert as_json.exit_code == 0 and '"answer": "VERIFIED"' in as_json.output
 
 
+@dataclasses.dataclass(frozen=True)
+class Later:
+    """A closed loop from a later step on."""
+
+    loop: ClosedLoop
+    first: int
+
+    @property
+    def horizon(self):
+        return self.loop.horizon - self.first
+
+    @property
+    def state_dim(self):
+        return self.loop.state_dim
+
+    def step(self, k, x, w):
+        return self.loop.step(k + self.first, x, w)
+
+
 def merged(case, path, *, at=4, shrink=0.0, gap=0.0):
     """The two cells of a case go on from step ``at`` as one box around both."""
-    found = case.verification
-    tracker, dynamics, w = case.tracker, case.problem.dynamics, case.problem.disturbance
-    hull = Box(found.tube.lower[:2, at].amin(0) + shrink, found.tube.upper[:2, at].amax(0) - shrink)
-    loop = ClosedLoop(dynamics, tracker, found.references[0])
-    run = Affine().run(loop, Box(hull.lower, hull.upper), w, first=at)
-    record = tubes_record(found)
+    record, tracker, dynamics, w = case.tubes, case.tracker, case.problem.dynamics, case.problem.disturbance
+    sides = record.tube_lower[:, at].min(0) + shrink, record.tube_upper[:, at].max(0) - shrink
+    hull = Box(*map(torch.from_numpy, sides))
+    loop = ClosedLoop(dynamics, tracker, torch.from_numpy(record.references[0]))
+    run = Affine().run(Later(loop, at), hull, w)
     late = record.relaxations.slope.shape[1] - at
 
     def joined(values, new):

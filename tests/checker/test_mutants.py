@@ -36,8 +36,10 @@ class Truth:
     """What rollouts of the certified loop do: extreme starts under extreme disturbances, and some of all others."""
 
     def __init__(self, case, rng):
-        self.case, self.rng, tubes = case, rng, case.verification
-        self.start = [Box(lo, hi) for lo, hi in zip(tubes.cells.lower[0], tubes.cells.upper[0], strict=True)]
+        self.case, self.rng, self.tubes = case, rng, case.tubes
+        corners = (torch.from_numpy(v) for v in (self.tubes.cell_lower, self.tubes.cell_upper))
+        self.start = [Box(low, high) for low, high in zip(*corners, strict=True)]
+        self.reference = torch.from_numpy(self.tubes.references[0])
         self.states, self.controls, self.w = zip(*(self.rollouts(c) for c in range(len(self.start))), strict=True)
 
     def rollouts(self, c, *, tracker=None, reference=None, disturbance=None, dynamics=None, count=96):
@@ -45,7 +47,7 @@ class Truth:
         loop = ClosedLoop(
             dynamics or case.problem.dynamics,
             tracker or case.tracker,
-            case.verification.references[0] if reference is None else reference,
+            self.reference if reference is None else reference,
         )
         w_box = disturbance or case.problem.disturbance
         x = torch.from_numpy(self.rng.uniform(size=(count, n)))
@@ -62,8 +64,8 @@ class Truth:
         """Whether a rollout of a changed loop clearly leaves the stored tube."""
         for c in range(len(self.start)):
             states, _, _ = self.rollouts(c, **changed)
-            lower, upper = self.case.verification.tube.lower[0, c], self.case.verification.tube.upper[0, c]
-            if (states < lower.numpy() - CLEARLY).any() or (states > upper.numpy() + CLEARLY).any():
+            lower, upper = self.tubes.tube_lower[c], self.tubes.tube_upper[c]
+            if (states < lower - CLEARLY).any() or (states > upper + CLEARLY).any():
                 return True
         return False
 
@@ -71,7 +73,7 @@ class Truth:
         """What goes into and comes out of each relaxation (not of the products) at step k, ``(count, 10)``."""
         x = torch.from_numpy(self.states[c][:, k])
         tracker, loop = self.case.tracker, ClosedLoop(
-            self.case.problem.dynamics, self.case.tracker, self.case.verification.references[0]
+            self.case.problem.dynamics, self.case.tracker, self.reference
         )  # fmt: skip
         errors = loop.window(k) - x[..., None, :]
         first = tracker.layers[0]((errors * tracker.error_scale).flatten(-2))
@@ -116,11 +118,11 @@ def tube(rng, truth) -> Iterator[Change]:
 
 
 def relaxation(rng, truth) -> Iterator[Change]:
-    record = truth.case.verification.recording
+    record = truth.tubes.relaxations
     while True:
         c, k, e = int(rng.integers(2)), int(rng.integers(8)), int(rng.integers(10))
         values, results = truth.operands(c, k)
-        s, o, r = (float(getattr(record, name)[0, c, k, ENTRIES[e]]) for name in ("slope", "offset", "radius"))
+        s, o, r = (float(getattr(record, name)[c, k, ENTRIES[e]]) for name in ("slope", "offset", "radius"))
         name = ("slope", "offset", "radius")[rng.integers(3)]
         step = float(rng.choice([-1, 1]) * 10.0 ** rng.uniform(-4, 0))
         new = {"slope": (s + step, o, r), "offset": (s, o + step, r), "radius": (s, o, r * rng.uniform(-1, 0.99))}[name]
@@ -129,10 +131,10 @@ def relaxation(rng, truth) -> Iterator[Change]:
 
 
 def product(rng, truth) -> Iterator[Change]:
-    record = truth.case.verification.recording
+    record = truth.tubes.relaxations
     while True:
         c, k, e = int(rng.integers(2)), int(rng.integers(8)), int(rng.choice([9, 11]))
-        radius = float(record.radius[0, c, k, e])
+        radius = float(record.radius[c, k, e])
         if radius < CLEARLY:
             continue
         yield [
@@ -164,17 +166,17 @@ def weight(rng, truth) -> Iterator[Change]:
 def reference(rng, truth) -> Iterator[Change]:
     while True:
         k, i = int(rng.integers(9)), int(rng.integers(4))
-        new = truth.case.verification.references[0].clone()
+        new = truth.reference.clone()
         new[k, i] += float(rng.choice([-1, 1]) * rng.uniform(0.1, 3))
         if truth.escape(reference=new):
             yield put("references", (0, k, i), float(new[k, i]))
 
 
 def cell(rng, truth) -> Iterator[Change]:
-    cells = truth.case.verification.cells
+    widths = truth.tubes.cell_upper - truth.tubes.cell_lower
     while True:
         c, i = int(rng.integers(2)), int(rng.integers(2))
-        width = float(cells.width[0, c, i])
+        width = float(widths[c, i])
         share = float(10.0 ** rng.uniform(-9, -0.1))
         yield [
             put("cell_upper", (c, i), lambda v: v - share * width),
@@ -246,7 +248,7 @@ def workspace(rng, truth) -> Iterator[Change]:
 
 
 def figure(rng, truth) -> Iterator[Change]:
-    faces = np.isfinite(truth.case.verification.goal_margin[0].numpy()).nonzero()[0]
+    faces = np.isfinite(truth.tubes.goal_margin[0]).nonzero()[0]
     while True:
         more = float(10.0 ** rng.uniform(-9, 1))
         if rng.random() < 0.5:

@@ -55,8 +55,9 @@ def verifier(outcomes, asked=None):
             references=references,
             start=box,
             disturbance=Box([0.0] * 3, [0.0] * 3),
-            cells=Box(box.lower[:, None], box.upper[:, None]),
-            tube=Tube(references[:, None], references[:, None]),
+            cell_reference=torch.arange(count),
+            cells=box,
+            tube=Tube(references, references),
             control_lower=torch.zeros(count, K, 1),
             control_upper=torch.zeros(count, K, 1),
             verdicts=tuple(Verdict(outcomes.get(t, Outcome.SAFE)) for t in tags),
@@ -132,7 +133,7 @@ def test_sampling_stops_at_the_budget_exactly():
 
 def test_a_library_of_several_batches_keeps_each_reference_with_its_tube():
     made = build([GOOD, CRASH, GOOD, GOOD, SHORT, GOOD], wanted=4, batch=2).certified
-    assert torch.equal(made.tube.lower[:, 0], made.references)
+    assert torch.equal(made.tube.lower, made.references)
     assert torch.equal(made.start.lower, made.references[:, 0])
     assert len(made.verdicts) == 4
 

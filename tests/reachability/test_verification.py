@@ -68,15 +68,16 @@ def prove(propagator, unicycle, tracker, refs, *, start=START, **options):
 
 def test_every_cell_of_every_reference_encloses_its_own_rollouts(unicycle, tracker):
     found = prove(Affine(), unicycle, tracker, references(3))
-    assert found.cells.lower.shape == (3, 6, 4) and found.tube.lower.shape == (3, 6, K + 1, 4)
+    assert found.cells.lower.shape == (18, 4) and found.tube.lower.shape == (18, K + 1, 4)
     generator = torch.Generator().manual_seed(0)
     for r in range(3):
         loop = ClosedLoop(unicycle, tracker, found.references[r])
+        cells, tubes = found.cells_of(r)
         for c in range(6):
-            x = Box(found.cells.lower[r, c], found.cells.upper[r, c]).sample(200, generator)
+            x = Box(cells.lower[c], cells.upper[c]).sample(200, generator)
             w = torch.where(torch.rand(200, K, 4, generator=generator) < 0.5, W.lower, W.upper)
             states, controls = loop.rollout(x, w)
-            assert bool(Tube(found.tube.lower[r, c], found.tube.upper[r, c]).contains(states).all())
+            assert bool(Tube(tubes.lower[c], tubes.upper[c]).contains(states).all())
             assert bool((controls >= found.control_lower[r]).all() & (controls <= found.control_upper[r]).all())
     assert [v.outcome for v in found.verdicts] == [Outcome.SAFE] * 3
     assert found.rigorous and found.propagator == "affine" and bool((found.seconds > 0).all())

@@ -21,11 +21,13 @@ def test_tubes_come_back_from_the_record_as_they_went(tubes):
     np.testing.assert_array_equal(again.seconds, tubes.seconds)
 
 
-def test_cells_that_belong_to_no_reference_are_refused(tubes):
+def test_a_reference_without_cells_and_cells_out_of_order_are_refused(tubes):
     owner = tubes.cell_reference.copy()
-    owner[0] = 1
-    with pytest.raises(ArtifactError, match="library.h5: /data/tubes/cell_reference must list equally many cells"):
+    owner[:] = 1
+    with pytest.raises(ArtifactError, match="library.h5: /data/tubes/cell_reference must list the cells of each"):
         verification_of(dataclasses.replace(tubes, cell_reference=owner), "library.h5")
+    with pytest.raises(ArtifactError, match="of each of 2 references in turn"):
+        verification_of(dataclasses.replace(tubes, cell_reference=tubes.cell_reference[::-1].copy()), "library.h5")
 
 
 def test_an_unknown_verdict_is_refused(tubes):

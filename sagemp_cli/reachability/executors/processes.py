@@ -44,8 +44,8 @@ class Processes:
 
     @contextmanager
     def opened(self, prover: CellProver) -> Iterator[Run]:
-        """See :class:`~sagemp_cli.reachability.executors.executor.Executor`; workers start when they are first needed."""
-        workers = self.workers or len(os.sched_getaffinity(0))
+        """See :class:`~sagemp_cli.reachability.executors.executor.Executor`; workers start when they are needed."""
+        workers = self.workers or _cores()
         pool: ProcessPoolExecutor | None = None
 
         def run(chunks: Sequence[Chunk]) -> Iterator[tuple[int, CellTubes]]:
@@ -68,16 +68,20 @@ class Processes:
             yield run
         except BrokenProcessPool:
             raise ResourceError(
-                "a worker process died (out of memory?); run again to go on, with fewer executor.workers or less verify.memory"
+                "a worker process died (out of memory?); run again to go on, "
+                "with fewer executor.workers or less verify.memory"
             ) from None
         finally:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _shared_out(
-    pool: ProcessPoolExecutor, chunks: Sequence[Chunk], *, ahead: int
-) -> Iterator[tuple[int, CellTubes]]:
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _shared_out(pool: ProcessPoolExecutor, chunks: Sequence[Chunk], *, ahead: int) -> Iterator[tuple[int, CellTubes]]:
     """Results as they are finished; few are waiting at any time, so that the chunks' inputs are not all held twice."""
     waiting = iter(chunks)
     with one_thread_per_child():  # the first submissions start the processes, which inherit the variables

@@ -15,8 +15,8 @@ def same_type(dtype: Any) -> None:
     """Refuse all types but float64."""
     if dtype not in (None, torch.float64, torch.double):
         raise UnsupportedOperationError(
-            f"conversion to {dtype}: rounding is not part of the real-arithmetic loop that is bounded; leave the conversion out "
-            f"(float32 weights are taken as the exact numbers they are)"
+            f"conversion to {dtype}: rounding is not part of the real-arithmetic loop that is bounded; "
+            f"leave the conversion out (float32 weights are taken as the exact numbers they are)"
         )
 
 

@@ -140,7 +140,8 @@ def einsum(equation: Any, *operands: Any) -> Traced:
         operands = tuple(operands[0])
     if not isinstance(equation, str) or len(operands) > 2 or sum(isinstance(o, Traced) for o in operands) != 1:
         raise UnsupportedOperationError(
-            "torch operation 'einsum' is supported of one value and at most one constant; use torch.matmul or products for two values"
+            "torch operation 'einsum' is supported of one value and at most one constant; "
+            "use torch.matmul or products for two values"
         )
     return _multilinear(functools.partial(_einsum, equation), *operands)
 
@@ -208,7 +209,8 @@ def _extreme(name: str) -> None:
     def of_all_or_two(x: Any, other: Any = None, **options: Any) -> Traced:
         if options or (other is not None and not is_tensor(other)):
             raise UnsupportedOperationError(
-                f"torch operation '{name}' along a dimension gives indices, which a set does not have; use torch.a{name}"
+                f"torch operation '{name}' along a dimension gives indices, which a set does not have; "
+                f"use torch.a{name}"
             )
         return fold(x, _dims(None, x.dim()), False) if other is None else elementwise(pairwise, x, other)
 

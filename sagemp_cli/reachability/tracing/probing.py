@@ -1,7 +1,7 @@
 """How a stranger's step is called, and whether it is what it must be: a function of ``x`` and ``w`` only.
 
-Calling a function a few times can refute, never prove. What is bounded in the end is a program recorded from one call
-(:mod:`sagemp_cli.reachability.tracing.value`); the calls made here test that the program says what the step does.
+Calling a function a few times can refute, never prove. What is bounded in the end is a program recorded from one
+call (:mod:`sagemp_cli.reachability.tracing.value`); the calls made here test that the program says what the step does.
 """
 
 from __future__ import annotations

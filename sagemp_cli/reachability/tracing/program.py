@@ -1,8 +1,8 @@
 """A straight-line program of torch operations: what one step of a stranger's loop does, once it has been recorded.
 
 Every slot holds a vector; the program runs on anything that answers torch's operations with the vector in the last
-dimension and any batch in front: plain tensors, and every propagator's sets. It needs little of them: ``v[..., index]``,
-:func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products, quotients and the
+dimension and any batch in front: plain tensors, and every propagator's sets. It needs little of them:
+``v[..., index]``, :func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products, quotients and the
 functions that have a relaxation.
 """
 

@@ -3,8 +3,8 @@
 A :class:`Traced` value is a tensor of ids (:class:`~sagemp_cli.reachability.tracing.program.Recorder`). Whatever only
 moves entries (indexing, reshaping, stacking, views, assignment in place) is done by torch itself on the ids, so that
 shapes, views and aliases are torch's own. Arithmetic and the functions that have a relaxation are written into the
-program. All else is an error that names the operation; above all, nothing may ask for the number that a value has: a set
-has none.
+program. All else is an error that names the operation; above all, nothing may ask for the number that a value has: a
+set has none.
 
 Constants are taken as the exact numbers they are: float32 weights are not rounded, nor is anything else.
 """
@@ -157,7 +157,8 @@ class Traced:
 
     def _number(self, *_: Any, **__: Any) -> Any:
         raise UnsupportedOperationError(
-            "float(), int(), item(), numpy, math.* and torch.tensor(...) ask for the number that a value has, a set has none; "
+            "float(), int(), item(), numpy, math.* and torch.tensor(...) ask for the number that a value has, "
+            "a set has none; "
             "use torch's functions on the value itself, and torch.stack to put values together"
         )
 
@@ -275,7 +276,8 @@ def _in_place(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Trace
     target, rest = args[0], args[1:]
     if not isinstance(target, Traced):
         raise UnsupportedOperationError(
-            f"torch operation '{name}' writes into a plain tensor, which cannot hold a set; start from torch.zeros_like(x)"
+            f"torch operation '{name}' writes into a plain tensor, which cannot hold a set; "
+            f"start from torch.zeros_like(x)"
         )
     if name in ("detach_", "requires_grad_"):
         return target

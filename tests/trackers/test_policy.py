@@ -1,0 +1,77 @@
+"""The tracking policy: the network it says it is, and its first layer folded onto a fixed reference."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from sagemp_cli.errors import ConfigError
+
+
+def test_the_controls_are_those_of_the_written_out_network(make_tracker):
+    tracker = make_tracker(
+        1, error_scale=[1, 2, 0.5, 3], control_scale=[0.5, 4.0], control_offset=[9.81, 0.0], negative_slope=0.2
+    )
+    errors = np.random.default_rng(0).normal(size=(3, 4))
+    h = (errors * [1, 2, 0.5, 3]).reshape(-1)
+    for layer in tracker.layers:
+        if layer is not tracker.layers[0]:
+            h = np.where(h > 0, h, 0.2 * h)
+        h = layer.weight.detach().numpy() @ h + layer.bias.detach().numpy()
+    expected = h * [0.5, 4.0] + [9.81, 0.0]
+    np.testing.assert_allclose(tracker(torch.from_numpy(errors)).detach().numpy(), expected, rtol=1e-13)
+
+
+def test_leading_dimensions_are_batch(make_tracker):
+    tracker, errors = make_tracker(), torch.randn(2, 5, 3, 4, dtype=torch.float64, generator=torch.Generator())
+    assert tracker(errors).shape == (2, 5, 2)
+    torch.testing.assert_close(tracker(errors)[1, 4], tracker(errors[1, 4]), rtol=1e-14, atol=1e-14)
+
+
+def test_folding_is_exact_in_rational_arithmetic(make_tracker):
+    """Weights, errors and scales are small dyadic numbers, so floating point makes no rounding error either."""
+    tracker = make_tracker(error_scale=[1, 2, 0.5, 4])
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in tracker.layers[0].parameters():
+            parameter.copy_(torch.randint(-64, 65, parameter.shape, generator=generator) / 32.0)
+    window = torch.randint(-128, 129, (3, 4), generator=generator) / 16.0
+    x = torch.randint(-128, 129, (4,), generator=generator) / 16.0
+    weight, bias = tracker.folded(window.double())
+    first, scale = tracker.layers[0], [Fraction(float(s)) for s in tracker.error_scale]
+    for row in range(8):
+        exact = Fraction(float(first.bias[row]))
+        for j in range(3):
+            for i in range(4):
+                error = Fraction(float(window[j, i])) - Fraction(float(x[i]))
+                exact += Fraction(float(first.weight[row, 4 * j + i])) * scale[i] * error
+        assert Fraction(float(weight[row] @ x.double() + bias[row])) == exact
+
+
+def test_folding_serves_a_batch_of_windows(make_tracker):
+    tracker = make_tracker()
+    window = torch.randn(6, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weight, bias = tracker.folded(window)
+    assert weight.shape == (8, 4) and bias.shape == (6, 8)
+    torch.testing.assert_close(bias[2], tracker.folded(window[2])[1], rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"lookahead": 0}, "tracker: lookahead and hidden widths must be positive, found 0 and [8, 8]"),
+        ({"hidden": []}, "tracker: lookahead and hidden widths must be positive, found 3 and []"),
+        ({"hidden": [8, 0]}, "tracker: lookahead and hidden widths must be positive, found 3 and [8, 0]"),
+        ({"negative_slope": 1.0}, "tracker: negative_slope must lie in [0, 1), found 1.0"),
+        ({"error_scale": [1.0]}, "tracker: error_scale needs 4 numbers, found 1"),
+        ({"control_scale": [1.0] * 3}, "tracker: control_scale needs 2 numbers, found 3"),
+        ({"control_offset": [1.0] * 3}, "tracker: control_offset needs 2 numbers, found 3"),
+    ],
+)
+def test_a_wrong_option_is_named(options, message, make_tracker):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        make_tracker(**options)

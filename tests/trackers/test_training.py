@@ -1,0 +1,144 @@
+"""Training the tracker: what it is trained on, that it learns, and that an interrupted run ends in the same bits."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.progress import Silent
+from sagemp_cli.trackers.training import RolloutSampler, train_tracker
+from sagemp_cli.trackers.tube_loss import TubeLoss
+
+
+def draw(references, start, disturbance, *, count=64, length=8, seed=0):
+    spread = torch.tensor([0.3, 0.2, 0.1, 0.1], dtype=torch.float64)
+    sampler = RolloutSampler(references, start, disturbance, length, spread)
+    return sampler.draw(count, torch.Generator().manual_seed(seed))
+
+
+def test_half_of_the_rollouts_start_in_the_start_set_at_step_0(references, start, disturbance):
+    drawn, x, _ = draw(references, start, disturbance)
+    early = [any(torch.equal(d, r) for r in references) for d in drawn]
+    assert sum(early) >= 32 and all(early[:32])
+    offset = x[:32] - drawn[:32, 0]
+    assert bool(start.contains(start.center + offset).all())
+    assert offset[:, :2].abs().amax() > 0.15, "the starts fill the set"
+
+
+def test_the_other_rollouts_start_near_a_later_step_of_their_reference(references, start, disturbance):
+    drawn, x, _ = draw(references, start, disturbance)
+    within = 0.5 * start.radius + torch.tensor([0.3, 0.2, 0.1, 0.1])
+    for reference, state in zip(drawn[32:], x[32:], strict=True):
+        assert bool((references == reference[0]).all(-1).any()), "the first step is one of a reference"
+        assert bool(((state - reference[0]).abs() <= within).all())
+    shifted = [not any(torch.equal(d[0], r[0]) for r in references) for d in drawn[32:]]
+    assert sum(shifted) > 16
+
+
+def test_a_shifted_reference_is_padded_with_its_last_step(references, start, disturbance):
+    drawn, _, _ = draw(references, start, disturbance)
+    assert drawn.shape[1:] == references.shape[1:]
+    for reference in drawn:
+        assert bool((reference[-1] == references[:, -1]).all(-1).any())
+
+
+def test_disturbances_come_from_the_set_and_every_second_one_is_held_at_a_vertex(references, start, disturbance):
+    _, _, w = draw(references, start, disturbance)
+    assert w.shape == (64, 8, 4)
+    assert bool(disturbance.contains(w).all())
+    assert bool((w[1::2] == w[1::2, :1]).all()) and bool((w[1::2].abs() > 0.99 * disturbance.radius)[..., 0].all())
+    assert bool((w[::2].std(1)[:, :2] > 0).all())
+
+
+def test_the_draw_depends_on_the_generator_alone(references, start, disturbance):
+    for a, b in zip(draw(references, start, disturbance), draw(references, start, disturbance), strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(draw(references, start, disturbance)[1], draw(references, start, disturbance, seed=1)[1])
+
+
+def tracking_error(tracker, unicycle, references, start):
+    with torch.no_grad():
+        x = references[:, 0] + start.radius
+        states, _ = ClosedLoop(unicycle, tracker, references).rollout(x, torch.zeros(2, 12, 4, dtype=torch.float64))
+    return float((states - references)[:, -1].square().sum(-1).mean())
+
+
+def test_plain_training_lowers_the_loss_and_the_tracking_error(unicycle, references, start, disturbance, make_tracker):
+    tracker = make_tracker()
+    before = tracking_error(tracker, unicycle, references, start)
+    history = train_tracker(
+        tracker,
+        unicycle,
+        references=references,
+        start=start,
+        disturbance=disturbance,
+        generator=torch.Generator().manual_seed(0),
+        steps=80,
+        batch=16,
+        rollout_steps=12,
+        learning_rate=0.02,
+    )
+    assert set(history.figures) == {"track", "state", "control"}
+    assert history.figures["track"][-10:].mean() < 0.3 * history.figures["track"][:5].mean()
+    assert tracking_error(tracker, unicycle, references, start) < 0.5 * before
+
+
+class _Interrupt(Silent):
+    """Presses Ctrl-C once a number of updates are done."""
+
+    def __init__(self, description: str) -> None:
+        self.description = description
+
+    def task(self, description, total, done=0):
+        if description == self.description:
+            raise KeyboardInterrupt
+        return super().task(description, total, done)
+
+
+def test_an_interrupted_run_ends_in_the_same_bits(
+    unicycle, references, start, disturbance, make_tracker, tmp_path
+):
+    def run(checkpoint=None, progress=None):
+        tracker = make_tracker()
+        try:
+            train_tracker(
+                tracker,
+                unicycle,
+                references=references,
+                start=start,
+                disturbance=disturbance,
+                generator=torch.Generator().manual_seed(0),
+                steps=4,
+                batch=4,
+                rollout_steps=6,
+                tube=TubeLoss(references=1, counts=[1, 1], steps=4),
+                tube_steps=3,
+                checkpoint=checkpoint,
+                progress=progress,
+            )
+        except KeyboardInterrupt:
+            return None
+        return tracker.state_dict()
+
+    whole = run()
+    checkpoint = tmp_path / "run.npz"
+    assert run(checkpoint, _Interrupt("training the tracker on its tubes")) is None
+    resumed = run(checkpoint)
+    assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+
+
+def test_rollouts_longer_than_the_reference_are_refused(unicycle, references, start, disturbance, make_tracker):
+    with pytest.raises(ConfigError, match=re.escape("training.rollout_steps must lie in 1..12, found 40")):
+        train_tracker(
+            make_tracker(),
+            unicycle,
+            references=references,
+            start=start,
+            disturbance=disturbance,
+            generator=torch.Generator(),
+            steps=1,
+        )
