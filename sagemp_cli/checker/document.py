@@ -143,6 +143,7 @@ _SHAPES = {
     "clearance": "R constraints",
     "goal_margin": "R n",
     "step": "R",
+    "seconds": "R",
 }
 _MERGED = {"cell_begin": "C", "cell_end": "C", "cell_heir": "C"}
 """There together or not at all."""
@@ -182,8 +183,15 @@ def _require_relaxations(
         raise ArtifactError(f"{path}: /data/tubes/relaxations/kept must be uint8 of shape {(*wanted[:2], 'bytes')}")
 
 
+_ARGUMENTS = {"state_dim", "control_dim", "lookahead", "hidden", "negative_slope"}
+_ARGUMENTS |= {"error_scale", "control_scale", "control_offset"}
+
+
 def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> Policy:
     """The tracker; ``negative_slope`` and ``lookahead`` are all that is taken from its constructor's arguments."""
+    unknown = set(arguments) - _ARGUMENTS
+    if unknown:
+        raise ValueError(f"tracker argument '{min(unknown)}' is not understood")
     depth = sum(name.endswith(".weight") for name in weights)
     layers = [(weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"]) for i in range(depth)]
     scales = [weights[name] for name in ("error_scale", "control_scale", "control_offset")]

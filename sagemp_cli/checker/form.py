@@ -249,15 +249,23 @@ class Form:
         scalars = [x.times(change(ball(c))) for x, c in zip(left.flat, right.flat, strict=True)]
         return Form(self.step, array_of(scalars, left.shape))
 
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return lambda *args, **kwargs: _handler(name)(self, *args, **kwargs)
+
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None) -> Any:
-        name = getattr(function, "__name__", str(function))
-        handler = _HANDLERS.get(name.strip("_"))
-        if handler is None:
-            raise UnsupportedOperationError(
-                f"torch operation '{name}' is unknown to the checker; add it in sagemp_cli/checker/form.py"
-            )
-        return handler(*args, **(kwargs or {}))
+        return _handler(getattr(function, "__name__", str(function)))(*args, **(kwargs or {}))
+
+
+def _handler(name: str) -> Callable[..., Any]:
+    handler = _HANDLERS.get(name.strip("_"))
+    if handler is None:
+        raise UnsupportedOperationError(
+            f"torch operation '{name}' is unknown to the checker; add it in sagemp_cli/checker/form.py"
+        )
+    return handler
 
 
 def array_of(scalars: Sequence[Scalar], shape: tuple[int, ...] | None = None) -> np.ndarray:

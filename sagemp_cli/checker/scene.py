@@ -30,16 +30,23 @@ class SafeSet:
     def of(cls, scene: Mapping[str, Any]) -> SafeSet:
         """From the config's ``scene`` section."""
 
-        def box(part: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+        def known(part: Mapping[str, Any], *keys: str) -> None:
+            if not set(part) <= set(keys):
+                raise Unproved(f"the scene says '{min(set(part) - set(keys))}', which is not understood")
+
+        def box(part: Mapping[str, Any], *more: str) -> tuple[list[float], list[float]]:
+            known(part, "lower", "upper", *more)
             return [float(v) for v in part["lower"]], [float(v) for v in part["upper"]]
 
+        known(scene, "workspace", "obstacles", "goal", "name", "description")
         obstacles = []
         for i, item in enumerate(scene["obstacles"]):
             name = str(item.get("name", f"obstacle {i}"))
             if item["kind"] == "ball":
+                known(item, "kind", "name", "center", "radius")
                 obstacles.append((name, "ball", [float(v) for v in item["center"]], float(item["radius"])))
             elif item["kind"] == "block":
-                obstacles.append((name, "block", *box(item)))
+                obstacles.append((name, "block", *box(item, "kind", "name")))
             else:
                 raise Unproved(f"obstacle '{name}' is of unknown kind '{item['kind']}'")
         return cls(box(scene["workspace"]), tuple(obstacles), box(scene["goal"]))

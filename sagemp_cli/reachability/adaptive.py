@@ -2,8 +2,8 @@
 
 A partition begins with one cell per reference. In each round every cell whose tube is not SAFE by itself is halved in
 each uncertain dimension for trial, all trials of all references in one batch, and the dimension is kept whose two
-halves together miss least. Rounds go on until all is SAFE, the budget is spent, or a reference cannot be proved at
-all. Halves share their face exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
+halves together miss least. Rounds go on until all is SAFE, the budget is spent, or it is plain that a reference will
+not be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ from torch import Tensor
 from sagemp_cli.reachability.proving import CellTubes
 from sagemp_cli.sets import Box, Tube
 
+PATIENCE = 3
+"""Splits in a row that may be in vain, before a cell, and with it its reference, is given up."""
+
+GAIN = 0.02
+"""A split is in vain if its halves miss on average more than ``1 - GAIN`` of what the whole cell missed."""
+
 _TIE = 1e-6
 """Relative difference of what is missing below which the narrower tubes decide."""
 
@@ -26,7 +32,7 @@ def adaptive_cells(
     *,
     budget: int,
     shortfall: Callable[[Tube], tuple[Tensor, Tensor]],
-    hopeless: Callable[[Tensor, Tensor], Tensor],
+    hopeless: Callable[[Tensor, Box], Tensor],
 ) -> CellTubes:
     """Cells that cover each start box, at most ``budget`` for each, split where it pays.
 
@@ -38,8 +44,8 @@ def adaptive_cells(
         budget: cells of one reference at most, the trials that were given up not counted.
         shortfall: of tubes, whether each is SAFE and how much is missing; see
             :func:`~sagemp_cli.reachability.verdict.shortfall`.
-        hopeless: ``hopeless(cell_reference (B,), states (B, n))`` says from which starts a rollout breaks the claim; a
-            reference with such a start is split no further.
+        hopeless: ``hopeless(cell_reference (B,), cells (B, n))`` says of which cells a rollout is known that breaks the
+            claim; a reference with such a cell is split no further.
 
     Returns:
         The cells, sorted by reference and corner. They cover every start box whether or not all of them are SAFE.
@@ -48,23 +54,28 @@ def adaptive_cells(
     found = prove(torch.arange(count), start)
     given_up = torch.zeros(count, dtype=torch.bool)
     fresh = torch.ones(count, dtype=torch.bool)  # cells that were not yet tried for a violating rollout
+    vain = torch.zeros(count, dtype=torch.int64)  # splits in a row that did not help, per cell
     while True:
         safe, missing = shortfall(found.tube)
         doubtful = torch.nonzero(fresh & ~safe).flatten()
         owners = found.cell_reference[doubtful]
-        given_up[owners[hopeless(owners, _box(found, doubtful).center)]] = True
+        if len(doubtful):
+            given_up[owners[hopeless(owners, _box(found, doubtful))]] = True
+        given_up[found.cell_reference[(vain >= PATIENCE) & ~safe]] = True
         fresh.zero_()
         chosen = _worst(found.cell_reference, safe | given_up[found.cell_reference], missing, budget)
         parents, halves = _halves(_box(found, chosen))
         if not len(parents):
             break
         trial = prove(found.cell_reference[chosen[parents]].repeat_interleave(2), halves)
-        best = _best(parents, trial, shortfall)
+        best, left = _best(parents, trial, shortfall)
         split = chosen[parents[best]]
+        more = torch.where(left > 2 * (1 - GAIN) * missing[split], vain[split] + 1, 0)
         whole = torch.ones(len(found), dtype=torch.bool)
         whole[split] = False
         found = CellTubes.join([found.select(torch.nonzero(whole).flatten()), trial.select(_pairs(best))])
         fresh = torch.cat([fresh[whole], torch.ones(2 * len(best), dtype=torch.bool)])
+        vain = torch.cat([vain[whole], more.repeat_interleave(2)])
     return found.select(_sorted(found))
 
 
@@ -98,8 +109,10 @@ def _halves(cells: Box) -> tuple[Tensor, Box]:
     return torch.tensor(parents, dtype=torch.int64), Box(torch.cat([none, *lowers]), torch.cat([none, *uppers]))
 
 
-def _best(parents: Tensor, trial: CellTubes, shortfall: Callable[[Tube], tuple[Tensor, Tensor]]) -> Tensor:
-    """The trial of each parent whose halves miss least together; where that is a tie, the one with narrower tubes."""
+def _best(
+    parents: Tensor, trial: CellTubes, shortfall: Callable[[Tube], tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """The trial of each parent whose halves miss least together, by narrower tubes if tied, and what those miss."""
     missing = shortfall(trial.tube)[1].unflatten(0, (-1, 2)).sum(1)
     width = torch.nan_to_num(trial.tube.width, nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
     spread = width.log().flatten(1).mean(1).unflatten(0, (-1, 2)).sum(1)
@@ -108,7 +121,8 @@ def _best(parents: Tensor, trial: CellTubes, shortfall: Callable[[Tube], tuple[T
         own = torch.nonzero(parents == parent).flatten()
         near = own[missing[own] <= missing[own].min() * (1 + _TIE)]
         best.append(int(near[spread[near].argmin()]))
-    return torch.tensor(best, dtype=torch.int64)
+    index = torch.tensor(best, dtype=torch.int64)
+    return index, missing[index]
 
 
 def _pairs(trials: Tensor) -> Tensor:

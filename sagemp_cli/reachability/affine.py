@@ -11,6 +11,7 @@ feedback then contracts. Rounding is included (last block), so the tube encloses
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -69,7 +70,7 @@ class Affine:
     @torch.no_grad()
     def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
-        return self.run(loop, start, disturbance).tube
+        return self._fast_run(loop, start, disturbance).tube
 
     @torch.no_grad()
     def propagate_with_controls(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor]:
@@ -80,10 +81,16 @@ class Affine:
     def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
         """As :meth:`propagate_with_controls`, with what a certificate keeps of the proof."""
         watched = _Watched(loop, [])
-        run = self.run(watched, start, disturbance)
+        run = self._fast_run(watched, start, disturbance)
         lower, upper = (torch.stack(side, dim=-2) for side in zip(*watched.controls, strict=True))
         bad = torch.isnan(lower) | torch.isnan(upper)
         return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
+
+    def _fast_run(self, loop: Loop, start: Box, disturbance: Box) -> AffineRun:
+        """:meth:`run` without autograd's bookkeeping; the tube is of ordinary tensors."""
+        with torch.inference_mode():
+            run = self.run(loop, start, disturbance)
+        return dataclasses.replace(run, tube=Tube(run.tube.lower.clone(), run.tube.upper.clone()))
 
     def run(
         self,

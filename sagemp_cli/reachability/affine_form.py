@@ -33,7 +33,8 @@ _SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and err
 
 
 class Relaxed(NamedTuple):
-    """One nonlinear operation of a step, as the forward pass met it: all that a backward pass needs (tensors only, no cycle).
+    """One nonlinear operation of a step, as the forward pass met it: all that a backward pass needs (tensors only, no
+    cycle).
 
     Attributes:
         name: of the operation.
@@ -42,7 +43,8 @@ class Relaxed(NamedTuple):
         first: index of the first of them.
         center, coefficients, magnitude, error: the input's form.
         lower, upper: the input's bounds that the band was made for (None for a product, which has a band of its own).
-        operation, parameters: how to get lines for those bounds; None for a product and where there is nothing but the band.
+        operation, parameters: how to get lines for those bounds; None for a product and where there is nothing but the
+            band.
         factors: of a product.
     """
 
@@ -62,23 +64,48 @@ class Relaxed(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """The deviations X and Y of a product's factors, as ``P = l X + Y / l`` and ``M = l X - Y / l``: ``X Y = (P^2 - M^2) / 4``.
+    """The deviations X and Y of a product's factors, as ``P = l X + Y / l`` and ``M = l X - Y / l``:
+    ``X Y = (P^2 - M^2) / 4``.
 
     Attributes:
-        sum, difference: coefficients of P and M, ``(variables, *batch, ...)``.
+        x, y: coefficients of X and Y, ``(variables, *batch, ...)``.
+        scale: l.
         plus, minus: bounds of ``|P|`` and ``|M|``, rounding included.
-        size: bound of ``|l X|`` and ``|Y / l|``, rounding included.
+        radius_x, radius_y: of ``|X|`` and ``|Y|``.
         middle: what the product's form counts of ``X Y`` itself; the rest is its error.
-        magnitude: of ``l X`` and ``Y / l`` together.
+        magnitude_x, magnitude_y: of the factors.
     """
 
-    sum: Tensor
-    difference: Tensor
+    x: Tensor
+    y: Tensor
+    scale: Tensor
     plus: Tensor
     minus: Tensor
-    size: Tensor
+    radius_x: Tensor
+    radius_y: Tensor
     middle: Tensor
-    magnitude: Tensor
+    magnitude_x: Tensor
+    magnitude_y: Tensor
+
+    @property
+    def sum(self) -> Tensor:
+        """Coefficients of P."""
+        return self.x * self.scale + self.y / self.scale
+
+    @property
+    def difference(self) -> Tensor:
+        """Coefficients of M."""
+        return self.x * self.scale - self.y / self.scale
+
+    @property
+    def size(self) -> Tensor:
+        """Bound of ``|l X|`` and ``|Y / l|``, rounding included."""
+        return torch.maximum(self.radius_x * self.scale, self.radius_y / self.scale) * _SAFETY
+
+    @property
+    def magnitude(self) -> Tensor:
+        """Of ``l X`` and ``Y / l`` together."""
+        return self.magnitude_x * self.scale + self.magnitude_y / self.scale
 
 
 Hints = Sequence[tuple[Tensor, Tensor] | None]
@@ -153,7 +180,7 @@ class StepFrame:
 class AffineForm(Form):
     """An enclosed value of shape ``shape``; see the module."""
 
-    __slots__ = ("center", "coefficients", "error", "frame", "magnitude")
+    __slots__ = ("_bounds", "_spread", "center", "coefficients", "error", "frame", "magnitude")
 
     def __init__(self, frame: StepFrame, center: Tensor, coefficients: Tensor, magnitude: Tensor, error: float) -> None:
         self.frame = frame
@@ -161,6 +188,8 @@ class AffineForm(Form):
         self.coefficients = coefficients
         self.magnitude = magnitude
         self.error = error
+        self._bounds: tuple[Tensor, Tensor] | None = None  # kept: one value often goes into several operations
+        self._spread: Tensor | None = None
 
     # -- reading -------------------------------------------------------------------------------------------------
 
@@ -188,10 +217,12 @@ class AffineForm(Form):
 
         The entries carry a relative rounding that :meth:`radius` accounts for.
         """
-        frame, rows = self.frame, self._rows()
-        n = frame.states
-        own = rows[..., n:] * frame.own_radius(rows.shape[-1] - n)
-        return torch.cat([rows[..., :n] @ frame.generators, own], dim=-1)
+        if self._spread is None:
+            frame, rows = self.frame, self._rows()
+            n = frame.states
+            own = rows[..., n:] * frame.own_radius(rows.shape[-1] - n)
+            self._spread = torch.cat([rows[..., :n] @ frame.generators, own], dim=-1)
+        return self._spread
 
     def _rows(self) -> Tensor:
         """Coefficients as ``(*batch, events, variables)``."""
@@ -224,8 +255,10 @@ class AffineForm(Form):
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper bound of the value."""
-        r = self.radius()
-        return self.center - r, self.center + r
+        if self._bounds is None:
+            r = self.radius()
+            self._bounds = self.center - r, self.center + r
+        return self._bounds
 
     # -- building ------------------------------------------------------------------------------------------------
 
@@ -298,8 +331,16 @@ def constant(frame: StepFrame, value: Any, like: Tensor) -> Tensor:
 
 
 def _broadcast(a: torch.Size, b: torch.Size) -> torch.Size:
-    """Shape of a broadcast (the common case first: torch's own function is slow)."""
-    return a if a == b or not b else torch.broadcast_shapes(a, b)
+    """Shape of a broadcast (torch's own function is slow)."""
+    if a == b or not b:
+        return a
+    short, long = sorted((a, b), key=len)
+    shape = list(long)
+    for i in range(1, len(short) + 1):
+        if short[-i] != 1 and shape[-i] not in (1, short[-i]):
+            return torch.broadcast_shapes(a, b)  # raises torch's own error
+        shape[-i] = max(shape[-i], short[-i]) if short[-i] and shape[-i] else 0
+    return torch.Size(shape)
 
 
 def _expand(form: AffineForm, shape: torch.Size, size: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -388,6 +429,14 @@ def divide(a: Any, b: Any) -> AffineForm:
     return AffineForm(a.frame, center / value, coefficients / value, magnitude / value.abs() + TINY, a.error + 2 * UNIT)
 
 
+def _spread_to(form: AffineForm, shape: torch.Size, coefficients: Tensor, size: int) -> Tensor:
+    """:meth:`AffineForm.spread` of a form that was broadcast to ``shape`` and padded to ``size`` variables."""
+    if form.shape != shape:
+        return AffineForm(form.frame, form.center.expand(shape), coefficients, form.magnitude, form.error).spread()
+    gap = size - form.coefficients.shape[0]
+    return torch.nn.functional.pad(form.spread(), (0, gap)) if gap else form.spread()
+
+
 def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     """Product of two forms whose deviations may be correlated.
 
@@ -400,8 +449,8 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     size = max(a.coefficients.shape[0], b.coefficients.shape[0])
     (c, gx, mx), (d, gy, my) = _expand(a, shape, size), _expand(b, shape, size)
     error = max(a.error, b.error)
-    rows_x = AffineForm(frame, c, gx, mx, error).spread()
-    rows_y = AffineForm(frame, d, gy, my, error).spread()
+    rows_x = _spread_to(a, shape, gx, size)
+    rows_y = _spread_to(b, shape, gy, size)
     # Rounding of the rows, of their sums, and of scaling (2 more units each) is within twice the usual slack.
     share = 2 * (error + frame.sum_error) * _SAFETY
     slack_x, slack_y = mx * share, my * share
@@ -419,21 +468,22 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
     larger, other = c.abs() * my, d.abs() * mx
     magnitude = larger + other + half + TINY  # |c| my >= |c d|, and half >= |middle|
     radius = half * _SAFETY + magnitude * ((2 * error + 16 * UNIT) * _SAFETY)
-    band = Band(ratio, middle, half)
-    factors = Factors(
-        gx * ratio + gy / ratio,
-        gx * ratio - gy / ratio,
-        plus,
-        minus,
-        torch.maximum(radius_x * ratio, radius_y / ratio) * _SAFETY,
-        middle,
-        mx * ratio + my / ratio,
-    )
+    center, coefficients = c * d + middle, c * gy + d * gx
+    factors = Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my)
     frame.relaxations.append(
-        Relaxed("product", band, radius, frame.size, c * d + middle, c * gy + d * gx, magnitude, error, factors=factors)
+        Relaxed(
+            "product",
+            Band(ratio, middle, half),
+            radius,
+            frame.size,
+            center,
+            coefficients,
+            magnitude,
+            error,
+            factors=factors,
+        )
     )
-    form = AffineForm(frame, c * d + middle, c * gy + d * gx, magnitude, error)
-    return form._with_fresh(form.center, form.coefficients, magnitude, radius)
+    return AffineForm(frame, center, coefficients, magnitude, error)._with_fresh(center, coefficients, magnitude, radius)
 
 
 @handles(torch.nn.functional.linear)
@@ -494,7 +544,7 @@ def _joined(join: Callable[..., Tensor], values: Sequence[Any], dim: int) -> Aff
             extra = value.dim() - (max(w.dim() for w in values) - len(frame.batch))
             if extra <= 0 and len(frame.batch):
                 value = value.expand(*frame.batch, *value.shape)
-            parts.append((value, value.new_zeros(size, *value.shape), value.abs()))
+            parts.append((value, value.new_zeros(size, *value.shape), value.abs() + TINY))
     centers, coefficients, magnitudes = zip(*parts, strict=True)
     return AffineForm(frame, join(centers, dim), join(coefficients, dim), join(magnitudes, dim), error)
 

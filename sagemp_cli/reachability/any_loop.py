@@ -67,7 +67,7 @@ def reach(
     what shapes it wants and that it is a function of its arguments, and recorded once on values that refuse what cannot
     be bounded. The propagator gets the recorded program. Enclosed are the rollouts in real arithmetic, the constants
     that meet ``x`` or ``w`` taken as the exact numbers they are; what the step computes from constants alone is taken
-    as torch computes it. A simulated rollout differs by its own rounding (noticeably in float32), which is not enclosed.
+    as torch computes it. A simulated rollout differs by its own rounding (most in float32), which is not enclosed.
 
     Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness).
     A step whose calls differ, or that leaves the recorded program on a simulated rollout, is refused.

@@ -1,19 +1,21 @@
 """The backward pass of CROWN over the steps that a forward pass recorded.
 
-The forward pass writes the inputs of every nonlinear operation, and the next state, as ``center + coefficients @ v`` where the
-variables v are the deviations ``z`` of state and disturbance and one error ``e_j = y_j - (slope x_j + offset)`` per relaxed
-entry ``y_j = f(x_j)``, scaled to [-1, 1]. A linear functional (a *row*) of the next state is then a functional of v. Backwards, in
-the reverse order of evaluation, each ``e_j`` is replaced by a line over x_j, the upper or the lower one according to the sign
-of its coefficient; and x_j is a function of earlier variables. What remains at the end of the step is a functional of
-``z``, which is a row of the previous state. With both lines parallel to the band this is affine arithmetic again; lines
-chosen by sign are what CROWN has more.
+The forward pass writes the inputs of every nonlinear operation, and the next state, as ``center + coefficients @ v``
+where the variables v are the deviations ``z`` of state and disturbance and one error
+``e_j = y_j - (slope x_j + offset)`` per relaxed entry ``y_j = f(x_j)``, scaled to [-1, 1]. A linear functional (a
+*row*) of the next state is then a functional of v. Backwards, in the reverse order of evaluation, each ``e_j`` is
+replaced by a line over x_j, the upper or the lower one according to the sign of its coefficient; and x_j is a function
+of earlier variables. What remains at the end of the step is a functional of ``z``, which is a row of the previous
+state. With both lines parallel to the band this is affine arithmetic again; lines chosen by sign are what CROWN has
+more.
 
 Everything that does not depend on the rows is done once for all steps of equal structure: a replacement is one product
 of the coefficients' positive and negative parts with a fixed matrix.
 
-Rounding. Each matrix has a column more, with the magnitudes ``|coefficients| |v|`` that pass through it. Their sum T bounds every
-intermediate result, so a step errs by at most ``gamma T`` (Higham 2002, section 3.1; gamma from the lengths of all sums), and
-that is added to the bound. The computed coefficients are taken as they are: what they differ from the exact ones by is in it.
+Rounding. Each matrix has a column more, with the magnitudes ``|coefficients| |v|`` that pass through it. Their sum T
+bounds every intermediate result, so a step errs by at most ``gamma T`` (Higham 2002, section 3.1; gamma from the
+lengths of all sums), and that is added to the bound. The computed coefficients are taken as they are: what they differ
+from the exact ones by is in it.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ class Product(NamedTuple):
     """Planes over a product's factors, see :func:`_tilted`. Upper bounds first, then lower ones, ``(*batch, 1, 2E)``.
 
     Attributes:
-        tilts: what a plane may be tilted along, the difference M and the sum P, as coefficients ``(*batch, 2E, first)``.
+        tilts: what a plane may be tilted along, the difference M and the sum P, as coefficients
+            ``(*batch, 2E, first)``.
         top: the plane's height when it is not tilted.
         free: the tilts up to ``free / 2`` cost only their square.
         size: the largest tilt.
@@ -100,7 +103,8 @@ class Bounds:
     """What a backward pass found.
 
     Attributes:
-        state: ``(lower, upper)`` of the deviations of the states from their centres per target step, ``(*batch, targets, n)``.
+        state: ``(lower, upper)`` of the deviations of the states from their centres per target step,
+            ``(*batch, targets, n)``.
         inputs: the same of each operation's input, per target step and operation, ``(*batch, E)``; None where unknown.
     """
 
@@ -120,7 +124,7 @@ class Bounds:
 
 
 def compiled(steps: Sequence[AffineForm]) -> list[Step]:
-    """The recorded steps, ready for rows; equal structures are stacked, so that each line is found in one call for all of them."""
+    """The recorded steps, ready for rows; equal structures are stacked, so that lines are found in one call for all."""
     parts: list[Step] = []
     for _, group in itertools.groupby(steps, key=_structure):
         parts += _compile(list(group))
@@ -170,12 +174,12 @@ def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, 
                 values = torch.cat([values, r.input], dim=-2)
                 constant = torch.cat([constant, constant.new_zeros(*r.input.shape[:-1], 1)], dim=-2)
                 joined.append((k, i - 1, r.input.shape[-2]))
-        gain = values[..., :1] + step.rounding * values[..., 1:2]
+        gain = values[..., :1] + (step.rounding * values[..., 1:2] + TINY)
         constant = constant + gain
         constant = constant + (constant.abs() + gain.abs()) * (4 * UNIT)
         rows = torch.cat([constant, values[..., _LEAD:]], dim=-1)
     reach = rows[..., 1:].abs() @ radius[..., None]
-    upper = rows[..., 0] + reach[..., 0] * ((1.0 + (2 * n + 4) * UNIT) * _SAFETY)
+    upper = rows[..., 0] + reach[..., 0] * (1.0 + (2 * n + 8) * UNIT)
     upper = upper + (upper.abs() + reach[..., 0]) * (4 * UNIT)
     upper = torch.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=math.inf)
     return _collected(upper, joined, targets, [len(steps[k].replacements) - 1 for k in targets])
@@ -198,11 +202,12 @@ def _likely(rows: Tensor, step: Step) -> Tensor:
 def _tilted(parts: Tensor, product: Product, likely: Tensor) -> Tensor:
     """What replaces the error of a product ``X Y``: a plane, tilted so that it is low where the row is large.
 
-    ``X Y = (P^2 - M^2) / 4`` with ``|P| <= p``, ``|M| <= m`` and ``|P| + |M| <= 2 s``. For every tilt ``|a| <= s`` the excess
-    over ``a M`` is at most ``p^2 / 4 + a^2`` if ``2 |a| <= q = min(m, 2 s - p)``, and ``p^2 / 4 - q^2 / 4 + |a| q`` otherwise:
-    ``P^2`` is at its largest for ``|M| <= 2 s - p``, and beyond that the boundary ``|P| = 2 s - |M|`` makes the excess
-    linear, falling outwards. For independent factors (p = m = 2 s) and ``a = +-s`` these are McCormick's planes, for
-    ``a = 0`` the band of affine arithmetic. Below it is the same with P and M exchanged.
+    ``X Y = (P^2 - M^2) / 4`` with ``|P| <= p``, ``|M| <= m`` and ``|P| + |M| <= 2 s``. For every tilt ``|a| <= s`` the
+    excess over ``a M`` is at most ``p^2 / 4 + a^2`` if ``2 |a| <= q = min(m, 2 s - p)``, and
+    ``p^2 / 4 - q^2 / 4 + |a| q`` otherwise: ``P^2`` is at its largest for ``|M| <= 2 s - p``, and beyond that the
+    boundary ``|P| = 2 s - |M|`` makes the excess linear, falling outwards. For independent factors (p = m = 2 s) and
+    ``a = +-s`` these are McCormick's planes, for ``a = 0`` the band of affine arithmetic. Below it is the same with P
+    and M exchanged.
     """
     star = torch.nan_to_num(likely @ product.tilts.mT)
     inside = star.abs() <= product.free

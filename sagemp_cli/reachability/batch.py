@@ -1,20 +1,21 @@
-"""One shape for cells, references and loops that share a batch."""
+"""One batch shape for a loop with several references and a start box with several cells."""
 
 from __future__ import annotations
 
 import torch
 
+from sagemp_cli.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.errors import UsageError
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
 
 
-@torch.no_grad()
 def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
-    """The start box in the batch shape of the loop's results: what one plain step from its centre gives.
+    """The start box, broadcast against the batch of the loop's references.
 
     Args:
-        loop: may have a batch of its own, as references have.
+        loop: a :class:`~sagemp_cli.closed_loop.ClosedLoop`, folded or not, may have a batch; any other loop has none
+            of its own.
         start: ``(..., n)``.
         disturbance: ``(d,)``.
 
@@ -26,5 +27,10 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
         raise UsageError(f"the start box has {start.dim} dimensions, the loop's state has {n}")
     if disturbance.lower.dim() != 1:
         raise UsageError(f"the disturbance must be one box (d,), found shape {tuple(disturbance.lower.shape)}")
-    shape = loop.step(0, start.center, disturbance.center).shape
+    own = torch.Size()
+    if isinstance(loop, ClosedLoop):
+        own = loop.references.shape[:-2]
+    elif isinstance(loop, FoldedLoop):
+        own = loop.biases.shape[:-2]
+    shape = (*torch.broadcast_shapes(own, start.lower.shape[:-1]), n)
     return Box(start.lower.expand(shape), start.upper.expand(shape))

@@ -1,8 +1,8 @@
 """Affine arithmetic and CROWN together: the intersection of both, each sharpening the other's intermediate bounds.
 
-A forward affine pass finds relaxations; a backward sweep over them bounds all states and the inputs of all operations once
-more; the next round's relaxations are made for the intersected bounds. All tubes enclose the same rollouts, so their
-intersection does; it lies inside those of :class:`~sagemp_cli.reachability.affine.Affine` and
+A forward affine pass finds relaxations; a backward sweep over them bounds all states and the inputs of all operations
+once more; the next round's relaxations are made for the intersected bounds. All tubes enclose the same rollouts, so
+their intersection does; it lies inside those of :class:`~sagemp_cli.reachability.affine.Affine` and
 :class:`~sagemp_cli.reachability.crown.Crown`, which are its first round.
 """
 

@@ -1,8 +1,8 @@
 """What all value types have in common that stand for a set and answer torch's operations.
 
-A propagator evaluates ``loop.step`` once on such values. A type brings its own linear operations (``handlers``) and one method,
-:meth:`Form.relaxed`, for what is not linear; the nonlinear functions themselves are written once for all types, in
-:mod:`sagemp_cli.reachability.relaxed_operations`.
+A propagator evaluates ``loop.step`` once on such values. A type brings its own linear operations (``handlers``) and
+one method, :meth:`Form.relaxed`, for what is not linear; the nonlinear functions themselves are written once for all
+types, in :mod:`sagemp_cli.reachability.relaxed_operations`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Interval arithmetic: a box after every step. The simplest propagator, and the loosest.
 
-It forgets how coordinates hang together, so even a contracting loop's boxes usually grow: a baseline, and a second opinion on
-single steps.
+It forgets how coordinates hang together, so even a contracting loop's boxes usually grow: a baseline, and a second
+opinion on single steps.
 """
 
 from __future__ import annotations

@@ -54,7 +54,9 @@ class IntervalForm(Form):
 
     def widened(self, name: str, band: Band) -> IntervalForm:
         """``slope * self + offset + [-radius, radius]``."""
-        return add(multiply(self, band.slope), IntervalForm(*_outwards(band.offset - band.radius, band.offset + band.radius)))
+        return add(
+            multiply(self, band.slope), IntervalForm(*_outwards(band.offset - band.radius, band.offset + band.radius))
+        )
 
     def __getitem__(self, index: Any) -> IntervalForm:
         return IntervalForm(self.lower[index], self.upper[index])
@@ -159,7 +161,7 @@ def divide(a: Any, b: Any) -> IntervalForm:
 
 @handles(torch.nn.functional.linear)
 def linear(x: IntervalForm, weight: Tensor, bias: Tensor | None = None) -> IntervalForm:
-    """``x W^T + b``; the rounding of the sums is at most gamma times the sums of absolute values (Higham 2002, section 3.1)."""
+    """``x W^T + b``; the sums round by at most gamma times the sums of absolute values (Higham 2002, section 3.1)."""
     apply = torch.nn.functional.linear
     positive, negative = weight.clamp(min=0.0), weight.clamp(max=0.0)
     size = apply(torch.maximum(x.lower.abs(), x.upper.abs()), weight.abs(), None if bias is None else bias.abs())

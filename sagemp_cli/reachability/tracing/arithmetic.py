@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -112,7 +113,28 @@ def multiply(a: Any, b: Any) -> Any:
     """Product; of two constants as torch computes it."""
     if not isinstance(a, Traced) and not isinstance(b, Traced):
         return a * b
-    return elementwise(_product, a, b)
+    if not (isinstance(a, Traced) and isinstance(b, Traced)):
+        return elementwise(_product, a, b)
+    # A matrix of values often has constants in it (a rotation's zeros and ones): with these, products are linear.
+    left, right = (v.ids for v in torch.broadcast_tensors(a, b))
+    fixed = a.recorder.constant_entries(left) | a.recorder.constant_entries(right)
+    if not bool(fixed.any()) or bool(fixed.all()):
+        return elementwise(_product, a, b)
+    ids = torch.empty(left.shape, dtype=torch.int64)
+    for entries in (fixed, ~fixed):
+        ids[entries] = _scaled(a._like(left[entries]), b._like(right[entries])).ids
+    return a._like(ids)
+
+
+def _scaled(a: Traced, b: Traced) -> Traced:
+    """Products of vectors whose entries are constant in either, or in none."""
+    constant = a.recorder.constant_entries
+    swapped = constant(b.ids)
+    first = torch.where(swapped, b.ids, a.ids)
+    second = torch.where(swapped, a.ids, b.ids)
+    if not a.recorder.is_constant(first):
+        return elementwise(_product, a, b)
+    return elementwise(_product, a._like(first), a._like(second))
 
 
 @answers("div", "divide", "true_divide", "__truediv__", "__rtruediv__")
@@ -132,9 +154,9 @@ def negate(a: Traced) -> Traced:
 @answers("pow", "__pow__", "float_power")
 def power(a: Any, exponent: Any) -> Traced:
     """Powers whose exponent is a number."""
-    if isinstance(exponent, (Tensor, np.ndarray, np.generic)) and np.size(exponent) == 1:
+    if type(exponent) is not Traced and is_tensor(exponent) and math.prod(exponent.shape) == 1:
         exponent = exponent.item()
-    if not isinstance(a, Traced) or not isinstance(exponent, (int, float)):
+    if not isinstance(a, Traced) or type(exponent) not in (int, float):
         raise UnsupportedOperationError("torch operation 'pow' is supported with a number as exponent")
     return elementwise(torch.pow, a, exponent)
 

@@ -15,10 +15,11 @@ from sagemp_cli.reachability.tracing.program import Recorder
 from sagemp_cli.reachability.tracing.value import ANSWERS, Traced, answers, ids_of, recorder_of, refuse_traced_index
 
 MOVES = """
-    adjoint atleast_1d atleast_2d atleast_3d broadcast_to chunk clone contiguous detach diag diag_embed diagflat
-    diagonal expand flatten flip fliplr flipud gather hsplit index_select moveaxis movedim narrow permute positive ravel repeat
-    repeat_interleave reshape roll rot90 select split split_with_sizes squeeze swapaxes swapdims t take take_along_dim
-    tensor_split tile transpose tril triu unbind unflatten unfold unsqueeze view vsplit
+    adjoint atleast_1d atleast_2d atleast_3d broadcast_to chunk clone contiguous detach diag diag_embed
+    diagflat diagonal expand flatten flip fliplr flipud gather hsplit index_select moveaxis movedim narrow
+    permute positive ravel repeat repeat_interleave reshape roll rot90 select split split_with_sizes squeeze
+    swapaxes swapdims t take take_along_dim tensor_split tile transpose tril triu unbind unflatten unfold
+    unsqueeze view vsplit
 """
 """Torch functions of one value that move its entries, repeat them, drop them, or put zeros beside them."""
 

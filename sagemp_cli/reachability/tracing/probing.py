@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.tracing.program import Program, Recorder
-from sagemp_cli.reachability.tracing.value import Traced
+from sagemp_cli.reachability.tracing.value import UFUNCS, Traced
 from sagemp_cli.sets import Box
 
 TOLERANCE = 1e-9
@@ -26,6 +27,15 @@ TOLERANCE = 1e-9
 
 class _Exact(Tensor):
     """float64 tensors that meet float32 constants as the exact numbers those are, where torch would refuse or round."""
+
+    __deepcopy__ = lambda self, memo: self.clone()  # noqa: E731
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        # Numpy would hand over its own results through a protocol that is on its way out.
+        if ufunc.__name__ in UFUNCS and method == "__call__" and not options:
+            return UFUNCS[ufunc.__name__](*(torch.as_tensor(i) if isinstance(i, np.ndarray) else i for i in inputs))
+        plain = (i.detach().as_subclass(Tensor).numpy() if isinstance(i, Tensor) else i for i in inputs)
+        return torch.as_tensor(getattr(ufunc, method)(*plain, **options))
 
     @classmethod
     def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
@@ -83,6 +93,8 @@ class Step:
         shape = inputs[0].shape
         with torch.no_grad():
             result = self._called(k, *inputs)
+        if recorder.refusal is not None:
+            raise recorder.refusal
         _check_result(result, shape)
         if isinstance(result, Traced):
             if result.recorder is not recorder:
@@ -134,6 +146,7 @@ def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box
         raise UsageError(f"step works neither on one state ({why_single}) nor on a batch ({why_rows})")
     first = rows if single is None else single
     reproduced(Step(function, batched=single is None), xs, ws, first)
+    _same_on_plain_tensors(function, xs, ws, first, batched=single is None)
     # A batch means something only if its rows are stepped one by one: x[0] of a batch is a row, not a state's entry.
     rowwise = rows is not None and together is not None and agree(together, rows)
     if single is None and not rowwise:
@@ -149,14 +162,38 @@ def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box
 def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
     """Refuse a step that gives other results than before; under autograd, too."""
     for grad in (False, True):
-        with torch.set_grad_enabled(grad):
-            after = step.all(0, xs, ws)
+        try:
+            with torch.set_grad_enabled(grad):
+                after = step.all(0, xs, ws)
+        except SagempError as error:
+            raise UsageError(
+                f"step works when it is called first and fails when it is called again ({error}); it must be a "
+                f"function of x and w only, no state kept between calls"
+            ) from error
         if not torch.equal(after, before):
             raise UsageError(
                 f"step gives another result when it is called again with the same x and w (difference "
                 f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness "
                 f"(dropout: call .eval()), no counters, no state kept between calls"
             )
+
+
+def _same_on_plain_tensors(
+    function: Callable[[int, Any, Any], Any], xs: Tensor, ws: Tensor, before: Tensor, *, batched: bool
+) -> None:
+    """Refuse a step that does something else on plain float64 tensors, where it runs on these at all.
+
+    It often does not (float32 weights), or rounds to float32: hence the tolerance.
+    """
+    for x, w, expected in zip(xs, ws, before, strict=True):
+        try:
+            with torch.no_grad():
+                result = function(0, x[None].clone(), w[None].clone()) if batched else function(0, x.clone(), w.clone())
+            plain = result.to(torch.float64).reshape(expected.shape)
+        except Exception:  # a stranger's code may raise anything
+            return
+        if not bool(((plain - expected).abs() <= 1e-4 * (1.0 + expected.abs())).all()):
+            raise UsageError("step gives another result on plain float64 tensors; it must not look at their type")
 
 
 def agree(a: Tensor, b: Tensor) -> bool:

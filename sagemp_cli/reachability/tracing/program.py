@@ -2,8 +2,8 @@
 
 Every slot holds a vector; the program runs on anything that answers torch's operations with the vector in the last
 dimension and any batch in front: plain tensors, and every propagator's sets. It needs little of them:
-``v[..., index]``, :func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products, quotients and the
-functions that have a relaxation.
+``v[..., index]``, :func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products,
+quotients and the functions that have a relaxation.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import UsageError
+from sagemp_cli.errors import SagempError, UsageError
 
 
 class Slot(NamedTuple):
@@ -75,12 +75,14 @@ class Recorder:
     Attributes:
         zero: the id of the constant 0, which is 0: operations that fill with zeros fill with it.
         unwritten: the id of an entry that has no value yet.
+        refusal: the first error that said that the step cannot be bounded, should the step have caught it.
     """
 
     zero = 0
     unwritten = -1
 
     def __init__(self, x: Tensor, w: Tensor) -> None:
+        self.refusal: SagempError | None = None
         self._instructions: list[Instruction | None] = []
         self._starts: list[int] = []
         self._constant: list[bool] = []
@@ -97,15 +99,14 @@ class Recorder:
         """Ids of constants, in the shape of ``value`` (float64)."""
         return self._new(None, value.detach().reshape(-1).clone(), constant=True).reshape(value.shape)
 
-    def example(self, ids: Tensor) -> Tensor:
-        """The example's values."""
-        self._check_written(ids)
-        return self._table[ids]
-
     def is_constant(self, ids: Tensor) -> bool:
         """Whether no entry depends on the inputs."""
+        return bool(self.constant_entries(ids).all())
+
+    def constant_entries(self, ids: Tensor) -> Tensor:
+        """Which entries do not depend on the inputs."""
         self._check_written(ids)
-        return all(self._constant[o] for o in torch.unique(self._owners(ids.reshape(-1))).tolist())
+        return torch.tensor(self._constant)[self._owners(ids)]
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
@@ -114,7 +115,7 @@ class Recorder:
 
         The vector has one entry per id, or a single one if all are equal and ``full`` is not asked for.
         """
-        flat = ids.reshape(-1)
+        flat = ids.reshape(-1).contiguous()
         if self.is_constant(flat):
             return self._table[flat]
         unique, inverse = torch.unique(flat, return_inverse=True)
@@ -174,8 +175,8 @@ class Recorder:
         self._table[start:stop] = value
         return torch.arange(start, stop)
 
-    def _owners(self, flat: Tensor) -> Tensor:
-        return torch.bucketize(flat, torch.tensor(self._starts), right=True) - 1
+    def _owners(self, ids: Tensor) -> Tensor:
+        return torch.bucketize(ids.contiguous(), torch.tensor(self._starts), right=True) - 1
 
     def _check_written(self, ids: Tensor) -> None:
         if ids.numel() and int(ids.min()) < 0:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import NonFiniteError, UnsupportedOperationError, UsageError
+from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.form import unsupported
 from sagemp_cli.reachability.tracing.program import Recorder
 
@@ -72,6 +72,11 @@ class Traced:
         self.recorder = recorder
         self.ids = ids
 
+    @property
+    def __class__(self) -> type:  # type: ignore[override]
+        """A tensor, to those who ask with isinstance: a step must not do something else because it is recorded."""
+        return Tensor
+
     # -- what a tensor says of itself ---------------------------------------------------------------------------------
 
     shape = property(lambda self: self.ids.shape)
@@ -108,7 +113,7 @@ class Traced:
     is_complex = lambda self: False  # noqa: E731
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return len(self.ids) if self.ids.dim() else self._number()
 
     def __iter__(self) -> Iterator[Traced]:
         return iter([self._like(part) for part in self.ids])
@@ -124,6 +129,11 @@ class Traced:
 
     def _like(self, ids: Tensor) -> Traced:
         return Traced(self.recorder, ids)
+
+    def _refuse(self, words: str) -> Any:
+        error = UnsupportedOperationError(words)
+        self.recorder.refusal = self.recorder.refusal or error
+        raise error
 
     # -- entries ------------------------------------------------------------------------------------------------------
 
@@ -148,7 +158,7 @@ class Traced:
     # -- what a set does not have -------------------------------------------------------------------------------------
 
     def _compared(self, *_: Any) -> Any:
-        raise UnsupportedOperationError(
+        return self._refuse(
             "comparison: a step may not branch on a value, the truth of a set is not one of True and False; "
             "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
         )
@@ -156,7 +166,7 @@ class Traced:
     __bool__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __contains__ = _compared
 
     def _number(self, *_: Any, **__: Any) -> Any:
-        raise UnsupportedOperationError(
+        return self._refuse(
             "float(), int(), item(), numpy, math.* and torch.tensor(...) ask for the number that a value has, "
             "a set has none; "
             "use torch's functions on the value itself, and torch.stack to put values together"
@@ -172,7 +182,7 @@ class Traced:
         if method is None or name.startswith("__"):
             raise AttributeError(f"neither torch.Tensor nor a recorded value has '{name}'")
         if not callable(method):
-            raise unsupported(name)
+            return self._refuse(str(unsupported(name)))
         return lambda *args, **kwargs: _dispatch(method, (self, *args), kwargs)
 
     @classmethod
@@ -182,15 +192,13 @@ class Traced:
         return _dispatch(function, args, kwargs or {})
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        function = _UFUNCS.get(ufunc.__name__)
+        function = UFUNCS.get(ufunc.__name__)
         if function is None or method != "__call__" or options:
-            raise UnsupportedOperationError(
-                f"numpy operation '{ufunc.__name__}' does not work on sets; use torch.{ufunc.__name__}"
-            )
+            return self._refuse(f"numpy operation '{ufunc.__name__}' does not work on sets; use torch.{ufunc.__name__}")
         return _dispatch(function, inputs, {})
 
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        raise UnsupportedOperationError(f"numpy operation '{function.__name__}' does not work on sets; use torch's")
+        return self._refuse(f"numpy operation '{function.__name__}' does not work on sets; use torch's")
 
 
 def _operator(function: Any, *, swapped: bool = False, in_place: bool = False) -> Callable[[Traced, Any], Any]:
@@ -225,7 +233,7 @@ for _name, _function in {
 }.items():
     setattr(Traced, f"__{_name}__", _operator(_function))
 
-_UFUNCS = {
+UFUNCS = {
     "add": torch.add,
     "subtract": torch.sub,
     "multiply": torch.mul,
@@ -234,6 +242,7 @@ _UFUNCS = {
     "negative": torch.neg,
     "matmul": torch.matmul,
 }
+"""Numpy's functions that strangers reach by operators between arrays and tensors."""
 
 ANSWERS: dict[Any, Callable[..., Any]] = {}
 """What torch functions and tensor methods do on traced values: by name, or the function itself."""
@@ -251,6 +260,18 @@ def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 
 def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    try:
+        return _answered(function, args, kwargs)
+    except SagempError as error:
+        # A step that catches the error must not go on with something else than what it does on tensors.
+        for value in (*args, *kwargs.values()):
+            for each in value if type(value) in (list, tuple) else (value,):
+                if isinstance(each, Traced):
+                    each.recorder.refusal = each.recorder.refusal or error
+        raise
+
+
+def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     name = getattr(function, "__name__", str(function))
     if name == "__get__":
         raise unsupported(str(getattr(function, "__self__", name)))

@@ -1,0 +1,100 @@
+"""Memory of a verification, estimated before it begins: how many cells at once keep within a budget.
+
+The estimates count the arrays that are alive at the worst moment, with what one step of the loop shows: how many
+generators it adds and how many entries its nonlinear operations have. They are compared with measured peaks in the
+tests, and are meant to be above them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import ResourceError
+from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.proving import CellProver
+from sagemp_cli.sets import Box
+
+GIB = 2.0**30
+MOST_AT_ONCE = 128
+"""Cells in one call at most: more do not make it faster."""
+
+_NUMBER = 8  # bytes of a float64
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Bytes of one cell.
+
+    Attributes:
+        working: while it is propagated, given up afterwards; None if nothing is known of the propagator.
+        kept: of its tube and recorded relaxations.
+    """
+
+    working: float | None
+    kept: float
+
+
+@torch.no_grad()
+def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
+    """What one cell of a reference ``(K+1, n)`` takes; ``start (n,)`` is any of its start boxes.
+
+    With n states, d disturbances, M generators at the last step, E entries of nonlinear operations a step (H of the
+    widest one) and v = n + d + E variables a step, in numbers of 8 bytes:
+
+    - kept: ``2 (K+1) n + 2 K m + 3 K E`` and, where generators are reduced, a bit per generator and step;
+    - working, ``affine``: ``M (6 n + 3 H) + 12 v^2 + 2 kept``;
+    - working, ``crown`` and ``best``: as ``affine``, ``K (3 v^2 + 2 v n)`` for the steps and ``6 rows v`` for the sweep;
+    - working, ``interval``: ``40 v + 2 kept``.
+    """
+    loop, propagator = ClosedLoop(prover.dynamics, prover.tracker, reference[None]), prover.propagator
+    n, d, m, steps = loop.state_dim, prover.disturbance.dim, prover.dynamics.control_dim, loop.horizon
+    box = Box(start.center[None], start.center[None])
+    first = Affine().run(loop, box, prover.disturbance, horizon=1)
+    recording = first.recording()
+    entries, widest = recording.slope.shape[-1], max(recording.widths, default=1)
+    added = first.generators.shape[-1] - n
+    symbols = getattr(propagator, "symbols", None)
+    generators = n + steps * added if symbols is None else min(n + steps * added, max(symbols, n + 1) + added)
+    kept = 2 * (steps + 1) * n + 2 * steps * m + 3 * steps * entries
+    kept += 0 if symbols is None else steps * generators / 64
+    v = n + d + entries
+    working = {
+        "affine": generators * (6 * n + 3 * widest) + 12 * v**2 + 2 * kept,
+        "interval": 40 * v + 2 * kept,
+    }
+    rows = getattr(propagator, "rows", 0)
+    working["crown"] = working["best"] = (
+        working["affine"] + steps * (3 * v**2 + 2 * v * n) + 6 * min(rows, 2 * steps * n) * v
+    )
+    needed = working.get(propagator.name)
+    return Footprint(None if needed is None else _NUMBER * needed, _NUMBER * kept)
+
+
+def cells_within(memory: float, cells: int, found: Footprint, propagator: Propagator) -> int:
+    """Cells to propagate at once so that the working memory and the results of all keep within ``memory`` GiB.
+
+    Args:
+        memory: GiB, of this process for all results and of each process that propagates for its chunk.
+        cells: at most, altogether.
+        found: of one cell.
+        propagator: for the message.
+
+    Raises:
+        ResourceError: the results and one cell at a time need more.
+    """
+    results = 2 * cells * found.kept  # joined from chunks, which are there as well
+    working = found.working or 0.0
+    if results + working > memory * GIB:
+        raise ResourceError(
+            f"verify.memory is {memory:g} GiB, but up to {cells} cells need {results / GIB:.2g} GiB for their tubes and "
+            f"relaxations, and '{propagator.name}' {working / GIB:.2g} GiB for one cell at a time; "
+            f"raise verify.memory, or verify fewer references or cells"
+        )
+    if not working:
+        return MOST_AT_ONCE
+    return int(min(MOST_AT_ONCE, (memory * GIB - results) // working))
