@@ -1,7 +1,7 @@
 """The closed loops that the benchmarks measure: robot, references, tracker, sets; built once and kept in a cache.
 
-References come from trajectory optimisation and trackers are trained here, in minutes. The cache is a folder of NPZ files of plain
-arrays beside the recipe that made them; a recipe that changes makes its file stale and the case is built again.
+References come from trajectory optimisation and trackers are trained here, in minutes. The cache is a folder of NPZ
+files: plain arrays and the hash of the recipe that made them; a recipe that changes makes its case be built again.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.config import compose
 from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.experts import Expert, Weights, plan_demonstrations, solve_problem
-from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.progress import Progress, Silent, Task
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
@@ -115,10 +117,17 @@ RECIPES = {
             "steps": 600,
             "batch": 48,
             "rollout_steps": 50,
-            "weights": {"track": 1.0, "state": 0.1, "control": 3.0},
-            "tube_steps": 80,
+            "weights": {"track": 10.0, "state": 0.1, "control": 3.0},
+            "tube_steps": 150,
         },
-        tube={"references": 4, "counts": [1, 1], "steps": 60, "symbols": 40},
+        tube={
+            "weight": 0.2,
+            "references": 3,
+            "counts": [1, 1],
+            "steps": 100,
+            "symbols": 40,
+            "scale": [0.5, 0.5, 0.5, 1.0, 1.0, 2.0],
+        },
     ),
     "quadrotor": Recipe(
         dynamics="quadrotor",
@@ -142,10 +151,17 @@ RECIPES = {
             "steps": 800,
             "batch": 48,
             "rollout_steps": 50,
-            "weights": {"track": 1.0, "state": 0.1, "control": 3.0},
-            "tube_steps": 60,
+            "weights": {"track": 10.0, "state": 0.1, "control": 3.0},
+            "tube_steps": 100,
         },
-        tube={"references": 4, "counts": [1, 1, 1], "steps": 50, "symbols": 60},
+        tube={
+            "weight": 0.2,
+            "references": 3,
+            "counts": [1, 1, 1],
+            "steps": 100,
+            "symbols": 60,
+            "scale": [0.5] * 6 + [1.0] * 3 + [2.0] * 3,
+        },
     ),
 }
 
@@ -176,6 +192,17 @@ class Case:
         """X_I around the start of a reference."""
         shift = self.references[reference, 0] - self.references[0, 0]
         return Box.around(self.references[0, 0] + shift, self.start.radius)
+
+
+class Lines(Silent):
+    """Tells on standard error what long work has begun."""
+
+    @contextmanager
+    def task(self, description: str, total: int, done: int = 0) -> Iterator[Task]:
+        """Say it once."""
+        print(f"{description} ({total}) ...", file=sys.stderr, flush=True)
+        with super().task(description, total, done) as task:
+            yield task
 
 
 def load(name: str, folder: Path, *, progress: Progress | None = None) -> Case:
@@ -213,9 +240,7 @@ def _objects(recipe: Recipe) -> tuple[Dynamics, Tracker, Scene]:
         torch.manual_seed(SEED)
         sizes = {"state_dim": dynamics.state_dim, "control_dim": dynamics.control_dim}
         tracker: Tracker = build(config["tracker"], "tracker", **sizes)
-    scene = scene_from_mapping(
-        config["scene"], state_dim=dynamics.state_dim, position_dim=len(dynamics.position)
-    )
+    scene = scene_from_mapping(config["scene"], state_dim=dynamics.state_dim, position_dim=len(dynamics.position))
     return dynamics, tracker, scene
 
 
@@ -244,9 +269,7 @@ def _references(recipe: Recipe, dynamics: Dynamics, scene: Scene, progress: Prog
     return torch.from_numpy(np.stack(found))
 
 
-def _train(
-    recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None
-) -> None:
+def _train(recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None) -> None:
     train_tracker(
         tracker,
         dynamics,

@@ -1,4 +1,4 @@
-"""Affine arithmetic in plain float64, for the price of rigour: the propagator's algorithm without any account of rounding.
+"""Affine arithmetic in plain float64, for the price of rigour: the propagator without its account of rounding.
 
 It knows the operations of the benchmark's loops only, and its tubes prove nothing.
 """

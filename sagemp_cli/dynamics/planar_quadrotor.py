@@ -45,6 +45,7 @@ class PlanarQuadrotor(Dynamics):
         self.mass, self.gravity, self.inertia = float(mass), float(gravity), float(inertia)
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
         phi, lift = x[..., 2], u[..., 0] / self.mass
         return torch.stack(
             [

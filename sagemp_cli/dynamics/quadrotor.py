@@ -52,6 +52,7 @@ class Quadrotor(Dynamics):
         self.inertia = tuple(float(i) for i in inertia)
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
         psi, theta, phi = x[..., 3], x[..., 4], x[..., 5]
         p, q, r = x[..., 9], x[..., 10], x[..., 11]
         sin_psi, cos_psi = torch.sin(psi), torch.cos(psi)

@@ -22,5 +22,6 @@ class Unicycle(Dynamics):
     position = (0, 1)
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
         theta, v = x[..., 2], x[..., 3]
         return torch.stack([v * torch.cos(theta), v * torch.sin(theta), u[..., 0], u[..., 1]], dim=-1)

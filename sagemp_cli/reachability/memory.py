@@ -54,15 +54,14 @@ def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
     loop, propagator = ClosedLoop(prover.dynamics, prover.tracker, reference[None]), prover.propagator
     n, d, m, steps = loop.state_dim, prover.disturbance.dim, prover.dynamics.control_dim, loop.horizon
     box = Box(start.center[None], start.center[None])
-    first = Affine().run(loop, box, prover.disturbance, horizon=1)
-    recording = first.recording()
+    recording = Affine().run(loop, box, prover.disturbance, horizon=1).recording()
     entries, widest = recording.slope.shape[-1], max(recording.widths, default=1)
-    added = first.generators.shape[-1] - n
     symbols = getattr(propagator, "symbols", None)
-    generators = n + steps * added if symbols is None else min(n + steps * added, max(symbols, n + 1) + added)
+    v = n + d + entries
+    generators = n + steps * v  # each step adds its disturbances, its relaxations and a column of rounding per state
+    generators = generators if symbols is None else min(generators, max(symbols, n + 1) + v)
     kept = 2 * (steps + 1) * n + 2 * steps * m + 3 * steps * entries
     kept += 0 if symbols is None else steps * generators / 64
-    v = n + d + entries
     working = {
         "affine": generators * (6 * n + 3 * widest) + 12 * v**2 + 2 * kept,
         "interval": 40 * v + 2 * kept,

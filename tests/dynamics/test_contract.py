@@ -1,4 +1,4 @@
-"""What every robot model keeps to: shapes, the Euler step under both readings of the disturbance, exact derivatives, errors."""
+"""What every robot model keeps to: shapes, the Euler step under both readings of the disturbance, gradients, errors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def test_leading_dimensions_are_batch(any_robot):
     assert together.shape == x.shape and together.dtype == torch.float64
     for i in range(3):
         for j in range(2):
-            torch.testing.assert_close(together[i, j], any_robot.step(x[i, j], u[i, j], w[i, j]), rtol=1e-15, atol=1e-15)
+            torch.testing.assert_close(
+                together[i, j], any_robot.step(x[i, j], u[i, j], w[i, j]), rtol=1e-15, atol=1e-15
+            )
 
 
 def test_the_step_is_forward_euler_with_the_disturbance_in_the_derivative(any_robot):
@@ -92,5 +94,7 @@ def test_crossed_limits_are_refused(make_robot):
 
 
 def test_an_unknown_option_is_refused_with_the_nearest_known_one(make_robot):
-    with pytest.raises(ConfigError, match=re.escape("dynamics.mas: Quadrotor has no such option (did you mean 'mass'?)")):
+    with pytest.raises(
+        ConfigError, match=re.escape("dynamics.mas: Quadrotor has no such option (did you mean 'mass'?)")
+    ):
         make_robot("quadrotor", mas=2.0)

@@ -99,9 +99,7 @@ class _Interrupt(Silent):
         return super().task(description, total, done)
 
 
-def test_an_interrupted_run_ends_in_the_same_bits(
-    unicycle, references, start, disturbance, make_tracker, tmp_path
-):
+def test_an_interrupted_run_ends_in_the_same_bits(unicycle, references, start, disturbance, make_tracker, tmp_path):
     def run(checkpoint=None, progress=None):
         tracker = make_tracker()
         try:

@@ -75,13 +75,19 @@ def test_the_gradient_agrees_with_finite_differences(unicycle, references, start
 
 
 def test_training_with_it_narrows_the_tube(unicycle, references, start, disturbance, make_tracker):
-    common = dict(learning_rate=0.03, references=references, start=start, disturbance=disturbance, steps=20, batch=8, rollout_steps=12)
+    common = dict(
+        learning_rate=0.03,
+        references=references,
+        start=start,
+        disturbance=disturbance,
+        steps=20,
+        batch=8,
+        rollout_steps=12,
+    )
     widths = []
     for tube in (None, TubeLoss(weight=1.0, references=2, counts=[1, 1], steps=12, shrink=1.0)):
         tracker = make_tracker()
-        train_tracker(
-            tracker, unicycle, generator=torch.Generator().manual_seed(0), tube=tube, tube_steps=20, **common
-        )
+        train_tracker(tracker, unicycle, generator=torch.Generator().manual_seed(0), tube=tube, tube_steps=20, **common)
         tube_ = Affine().propagate(ClosedLoop(unicycle, tracker, references[0]), start, disturbance)
         widths.append(tube_.width[-1].mean().item())
     assert widths[1] < 0.9 * widths[0]

@@ -1,0 +1,110 @@
+"""Soundness campaign: millions of adversarial and random rollouts against the tubes of every certificate that exists.
+
+    python benchmarks/campaign.py [--rollouts 10000000] [--artifacts artifacts] [--processes 2]
+
+Takes every ``certificate.h5`` and ``library.h5`` below the artifacts folder (run the experiments first), shares the
+rollouts out among the references, and compares each with the hull of its cells' tubes, in worker processes with one
+thread each. Writes ``<artifacts>/benchmarks/campaign.json``, adding to what is there: a campaign can be interrupted
+and gone on with, and each round draws new rollouts. Ends with exit code 1 if a single rollout ever left its tube.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import json
+import multiprocessing
+import os
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.reachability.inner import SIMULATION_MARGIN, attack_tube
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.storage import Certificate, Library, open_header, read_artifact
+from sagemp_cli.trackers import Tracker
+
+BATCH = 50_000
+
+
+def attack(path: Path, index: int, count: int, seed: int) -> dict:
+    """Attack one reference of one file with ``count`` rollouts."""
+    torch.set_num_threads(1)
+    kind, _ = open_header(path)
+    artifact = read_artifact(path, Certificate if kind.name == "certificate" else Library)
+    tubes, problem = artifact.record.tubes, problem_of(artifact.header.config)
+    tracker = Tracker(**json.loads(artifact.record.tracker_arguments))
+    tracker.load_state_dict({k: torch.as_tensor(v) for k, v in artifact.record.tracker.items()})
+    tracker.requires_grad_(False)
+    own = torch.as_tensor(tubes.cell_reference) == index
+    hull = Tube(torch.as_tensor(tubes.tube_lower)[own], torch.as_tensor(tubes.tube_upper)[own]).hull()
+    found = attack_tube(
+        ClosedLoop(problem.dynamics, tracker, torch.as_tensor(tubes.references[index])),
+        Box(torch.as_tensor(tubes.start_lower[index]), torch.as_tensor(tubes.start_upper[index])),
+        Box(torch.as_tensor(tubes.disturbance_lower), torch.as_tensor(tubes.disturbance_upper)),
+        hull,
+        count=count,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    return {"rollouts": found.rollouts, "outside": found.outside, "escapes": found.escapes, "excess": found.excess}
+
+
+def jobs(artifacts: Path) -> list[tuple[Path, int]]:
+    """All references of all certificates and libraries, as (file, index)."""
+    found = []
+    for path in sorted([*artifacts.glob("*/certificate.h5"), *artifacts.glob("*/library.h5")]):
+        record = Certificate if path.stem == "certificate" else Library
+        found += [(path, i) for i in range(len(read_artifact(path, record).record.tubes.verdict))]
+    return found
+
+
+def main() -> int:
+    """Run the campaign; see the module."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rollouts", type=int, default=10_000_000)
+    parser.add_argument("--artifacts", type=Path, default=Path("artifacts"))
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    references = jobs(given.artifacts)
+    if not references:
+        print(f"{given.artifacts}: no certificates or libraries; run an experiment first")
+        return 2
+    out = given.artifacts / "benchmarks" / "campaign.json"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    state = json.loads(out.read_text()) if out.exists() else {"rollouts": 0, "outside": 0, "escapes": 0, "rounds": 0}
+    state.setdefault("files", {})
+    began = time.monotonic()
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(given.processes, mp_context=context) as pool:
+        while state["rollouts"] < given.rollouts:
+            todo = [references[(state["rounds"] + i) % len(references)] for i in range(given.processes)]
+            futures = [
+                pool.submit(attack, path, index, BATCH, state["rounds"] + i) for i, (path, index) in enumerate(todo)
+            ]
+            for (path, index), future in zip(todo, futures, strict=True):
+                found = future.result()
+                entry = state["files"].setdefault(
+                    f"{path.parent.name}/{path.name}#{index}", {"rollouts": 0, "worst": None}
+                )
+                entry["rollouts"] += found["rollouts"]
+                entry["worst"] = max(found["excess"], entry["worst"] if entry["worst"] is not None else -float("inf"))
+                for key in ("rollouts", "outside", "escapes"):
+                    state[key] += found[key]
+                state["rounds"] += 1
+                if found["escapes"]:
+                    print(f"ESCAPE: {path} reference {index}: {found}", file=sys.stderr)
+            state |= {"margin": SIMULATION_MARGIN, "seconds": state.get("seconds", 0.0) + time.monotonic() - began}
+            began = time.monotonic()
+            temporary = out.with_suffix(".tmp")
+            temporary.write_text(json.dumps(state, indent=1))
+            os.replace(temporary, out)
+            print(f"{state['rollouts']:,} rollouts, {state['outside']} outside, {state['escapes']} escapes", flush=True)
+    return 1 if state["escapes"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
