@@ -29,14 +29,18 @@ _KEYS = {
 """Keys of the sections that the stages read one by one."""
 
 
-def require_sound_config(config: Mapping[str, Any]) -> None:
+def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> None:
     """Check that every section fits what it configures, that the problem is well posed and the partition is one.
+
+    Args:
+        config: resolved config.
+        problem: whether to check the problem as well; a robot alone, without an experiment's sets, is none.
 
     Raises:
         ConfigError: one line with every complaint.
     """
     found = [*all_complaints(config), *_option_complaints(config)]
-    if not any(complaint.startswith("dynamics") for complaint in found):
+    if problem and not any(complaint.startswith("dynamics") for complaint in found):
         found += _problem_complaints(config)
     if found:
         raise ConfigError("; ".join(found))

@@ -45,7 +45,7 @@ def test_run_remakes_what_a_changed_key_makes_stale_and_what_follows_from_it(sag
     made_up.ran.clear()
     result = sagemp("run", "tracker.lookahead=7")
     assert made_up.ran == ["train-tracker", "verify", "build-library", "execute"]
-    assert "train-tracker: making it (stale: was made with tracker.lookahead=10, this config says 7)" in result.stdout
+    assert "train-tracker: making it (stale: was made with tracker.lookahead=5, this config says 7)" in result.stdout
     assert "verify: making it (stale: its input tracker.h5 has changed since)" in result.stdout
 
 
@@ -248,7 +248,7 @@ def test_status_tells_fresh_stale_and_missing_files_apart_and_says_why(sagemp, m
         "execute": "missing",
     }
     shown = sagemp("status", "tracker.lookahead=7").stdout
-    assert "was made with tracker.lookahead=10, this config says 7" in shown
+    assert "was made with tracker.lookahead=5, this config says 7" in shown
     assert "its input tracker.h5 is stale" in shown
 
 

@@ -258,9 +258,8 @@ def asks_for_the_type(x, w):
 
 
 def powers(x, w):
-    return (
-        0.5 * (x + 1) ** torch.tensor(2) - 0.3 * torch.square(x) + 0.1 * x ** np.int64(3) + (x + 1) ** -1 + w[..., :1]
-    )
+    even = 0.1 * (x + 1) ** torch.tensor(2) - 0.2 * torch.square(x)
+    return even + 0.1 * x ** np.int64(3) + 0.1 * (x + 2) ** -1 - 0.15 + w[..., :1]
 
 
 def half_open(x, w):

@@ -221,10 +221,12 @@ def _selection(index: Tensor) -> Run | Tensor:
 
 
 def _pick(value: Any, entries: Run | Tensor) -> Any:
-    return value[..., entries.first : entries.stop] if isinstance(entries, Run) else value[..., entries]
+    if isinstance(entries, Run):
+        return value[..., entries.first : entries.stop]
+    return value.index_select(-1, entries) if isinstance(value, Tensor) else value[..., entries]
 
 
 def _join(*parts: Any) -> Any:
     """Vectors one after the other; constants are repeated for the batch of the others."""
     batch = max((p.shape[:-1] for p in parts), key=len)
-    return torch.cat([p.expand(*batch, p.shape[-1]) if isinstance(p, Tensor) else p for p in parts], dim=-1)
+    return torch.cat([p if len(p.shape) > len(batch) else p.expand(*batch, p.shape[-1]) for p in parts], dim=-1)
