@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint reproduce-figures benchmark clean
+.PHONY: help venv demo test lint reproduce-figures benchmark campaign clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | \
@@ -51,9 +51,10 @@ reproduce-figures: venv  ## make every artifact and figure at full effort
 	$(BIN)/python -m sagemp_cli.report.reproduce
 
 benchmark: venv  ## run the benchmarks
-	@for file in benchmarks/*.py; do \
-		if test -f "$$file"; then echo "$$file"; $(BIN)/python "$$file" || exit $$?; else echo 'no benchmarks yet'; fi; \
-	done
+	$(BIN)/python benchmarks/reachability.py
+
+campaign: venv  ## attack every tube there is with ten million rollouts
+	$(BIN)/python benchmarks/campaign.py
 
 clean:  ## remove the environment and caches; artifacts/ stays
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis

@@ -46,7 +46,8 @@ class Recipe:
         references_from: radius of the box that the references start in.
         references: how many.
         expert: cost of the trajectory optimisation, and the margin to obstacles.
-        training: options of :func:`sagemp_cli.trackers.training.train_tracker`.
+        training: options of :func:`sagemp_cli.trackers.training.train_tracker`; under ``warm_up``, trainings that come
+            first, each with the options that differ.
         tube: options of :class:`sagemp_cli.trackers.tube_loss.TubeLoss`, None for the plain loss.
         horizon: K.
     """
@@ -147,21 +148,15 @@ RECIPES = {
             "margin": 0.4,
             "workspace_margin": 0.3,
         },
+        # Short rollouts first: those of an untrained tracker tumble, and their gradients overflow.
         training={
-            "steps": 800,
+            "warm_up": [{"steps": 300, "rollout_steps": 12}, {"steps": 300, "rollout_steps": 25}],
+            "steps": 400,
             "batch": 48,
             "rollout_steps": 50,
             "weights": {"track": 10.0, "state": 0.1, "control": 3.0},
-            "tube_steps": 100,
         },
-        tube={
-            "weight": 0.2,
-            "references": 3,
-            "counts": [1, 1, 1],
-            "steps": 100,
-            "symbols": 60,
-            "scale": [0.5] * 6 + [1.0] * 3 + [2.0] * 3,
-        },
+        tube=None,
     ),
 }
 
@@ -269,15 +264,21 @@ def _references(recipe: Recipe, dynamics: Dynamics, scene: Scene, progress: Prog
     return torch.from_numpy(np.stack(found))
 
 
-def _train(recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None) -> None:
-    train_tracker(
-        tracker,
-        dynamics,
-        references=references,
-        start=Box.around(recipe.start_center, recipe.start_radius),
-        disturbance=Box.around([0.0] * dynamics.state_dim, recipe.disturbance_radius),
-        generator=torch.Generator().manual_seed(SEED),
-        tube=None if recipe.tube is None else TubeLoss(**recipe.tube),
-        progress=progress,
-        **recipe.training,
-    )
+def _train(
+    recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None
+) -> None:
+    options = {k: v for k, v in recipe.training.items() if k not in ("warm_up", "tube_steps")}
+    last = {"tube": None if recipe.tube is None else TubeLoss(**recipe.tube)}
+    last |= {k: v for k, v in recipe.training.items() if k == "tube_steps"}
+    generator = torch.Generator().manual_seed(SEED)
+    for changes in (*recipe.training.get("warm_up", ()), last):
+        train_tracker(
+            tracker,
+            dynamics,
+            references=references,
+            start=Box.around(recipe.start_center, recipe.start_radius),
+            disturbance=Box.around([0.0] * dynamics.state_dim, recipe.disturbance_radius),
+            generator=generator,
+            progress=progress,
+            **(options | changes),
+        )

@@ -16,6 +16,8 @@ from sagemp_cli.checker.cell import Policy
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.storage.content import ContentError, content_hash
 
+_PLAIN_YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # plain data only, in C where it was compiled in
+
 KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
 """Schemas that can be checked, with the newest version of their format that is known here."""
 
@@ -93,7 +95,7 @@ def _read(file: h5py.File, path: Path) -> Document:
         raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
     if content_hash(file) != stored:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
-    config = yaml.safe_load(file["config"].asstr()[()])
+    config = yaml.load(file["config"].asstr()[()], Loader=_PLAIN_YAML)
     data, tubes = file["data"], file["data/tubes"]
     read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], h5py.Dataset)}
     _require_shapes(read, path)

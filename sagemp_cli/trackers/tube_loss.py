@@ -20,6 +20,9 @@ from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers.policy import Tracker
 
+WIDEST = 1e6
+"""Width from which on a tube counts as exploded, in any unit; its gradient says nothing any more."""
+
 
 @dataclass(frozen=True)
 class TubeLoss:
@@ -72,10 +75,15 @@ class TubeLoss:
         box = Box(around + cells.lower, around + cells.upper)
         w = Box(disturbance.lower * size, disturbance.upper * size)
         steps = min(self.steps, loop.horizon)
-        tube = Affine(symbols=self.symbols).run(loop, box, w, horizon=steps).tube
-        width = tube.width[:, 1:]
+        width = Affine(symbols=self.symbols).run(loop, box, w, horizon=steps).tube.width[:, 1:]
+        fits = (width.detach() <= WIDEST).all(-1).all(0)
+        if not bool(fits.all()):
+            # The gradient of a tube that overflows is NaN, also at the steps before: only those are run again.
+            last = max(1, int((~fits).nonzero()[0]))
+            width = Affine(symbols=self.symbols).run(loop, box, w, horizon=last).tube.width[:, 1:]
+            width = torch.cat([width, width.new_full((width.shape[0], steps - last, width.shape[-1]), WIDEST)], dim=1)
         scale = torch.as_tensor(self.scale, dtype=torch.float64)
-        cost = torch.log1p(torch.nan_to_num(width, nan=1e6, posinf=1e6).clamp(max=1e6) / scale)
+        cost = torch.log1p(width.clamp(max=WIDEST) / scale)
         value = cost.mean() + self.end * cost[:, -1].mean()
         return self.weight * value, {"width": float(width[:, -1].detach().clamp(max=1e9).mean()), "size": size}
 

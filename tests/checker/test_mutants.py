@@ -86,7 +86,7 @@ class Truth:
 
 def change_config(edit: Callable[[dict], None]) -> Change:
     def change(file):
-        config = yaml.safe_load(file["config"].asstr()[()])
+        config = yaml.load(file["config"].asstr()[()], Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         edit(config)
         del file["config"]
         file.create_dataset("config", data=yaml.safe_dump(config, sort_keys=True), dtype=h5py.string_dtype())

@@ -289,9 +289,10 @@ RIGHT = {
             matrix_on_the_left, matrix_on_the_right, einstein, rotation, in_place_on_a_copy, in_place_from_zeros,
             in_place_through_a_view, in_place_relu_seen_through_a_view, writes_into_its_argument, quotient,
             two_operand_limits, clamp_with_limits_of_the_state, one_sided_clamps, functions_of_all_kinds,
-            sums_and_means, total_of_one_state, scalar_product, shapes, by_its_own_shape, harmless_conversions, doubles_and_integers,
-            captured_with_gradient, rounding_matters, ignores_the_state, ignores_the_state_but_not_the_disturbance,
-            constant_folded, comprehension, keeps_a_log, unused_branch_of_the_seed, copied, cross_product, half_open,
+            sums_and_means, total_of_one_state, scalar_product, shapes, by_its_own_shape, harmless_conversions,
+            doubles_and_integers, captured_with_gradient, rounding_matters, ignores_the_state,
+            ignores_the_state_but_not_the_disturbance, constant_folded, comprehension, keeps_a_log,
+            unused_branch_of_the_seed, copied, cross_product, half_open,
             asks_for_the_type, powers,
         )
     },
@@ -316,7 +317,7 @@ def widened(step):
     return types.FunctionType(step.__code__, names, step.__name__, defaults, cells)
 
 
-def rollouts(step, *, count, start=START, disturbance=DISTURBANCE, horizon=K, vectorised):
+def rollouts(plain, *, count, start=START, disturbance=DISTURBANCE, horizon=K):
     """States ``(count, K+1, n)``: half of the starts and half of the disturbances at corners."""
     generator = torch.Generator().manual_seed(11)
     x = start.sample(count, generator)
@@ -328,14 +329,11 @@ def rollouts(step, *, count, start=START, disturbance=DISTURBANCE, horizon=K, ve
     w[::2] = bang[::2]
     states = [x]
     for k in range(horizon):
-        if vectorised:
-            states.append(step(states[-1].clone(), w[:, k].clone()))
-        else:
-            states.append(torch.stack([step(a.clone(), b) for a, b in zip(states[-1], w[:, k], strict=True)]))
+        states.append(plain(states[-1].clone(), w[:, k].clone()))
     return torch.stack([s.double().expand(x.shape) for s in states], dim=-2).detach()
 
 
-def takes_batches(step, name):
+def takes_batches(name):
     """Known of the functions above: those in the style ``x[..., i]`` do."""
     return name in BATCH_ONLY or "network" in name or name in (
         "many activations", "dropout in evaluation mode", "matrix_on_the_right", "einstein", "in_place_on_a_copy",
@@ -347,12 +345,22 @@ def takes_batches(step, name):
     )  # fmt: skip
 
 
+def plain(name):
+    """The step of that name in float64 on batches, made without the code under test."""
+    step = widened(RIGHT[name])
+    if takes_batches(name):
+        return step
+    if "numpy" not in name:
+        return torch.vmap(step)
+    return lambda x, w: torch.stack([step(a, b) for a, b in zip(x, w, strict=True)])
+
+
 @pytest.mark.filterwarnings("ignore:__array_wrap__:DeprecationWarning")  # numpy's, of arrays that meet plain tensors
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_tube_holds_2000_rollouts_of_the_plain_function(name):
     step = RIGHT[name]
     tube = reach(step, START, DISTURBANCE, K)
-    states = rollouts(widened(step), count=2000, vectorised=takes_batches(step, name))
+    states = rollouts(plain(name), count=2000)
     assert tube.horizon == K and bool(tube.bounded)
     assert torch.equal(tube.lower[0], START.lower) and torch.equal(tube.upper[0], START.upper)
     # The oracle itself rounds, the tube encloses exact rollouts: a point's tube may be as thin as that.
@@ -368,7 +376,7 @@ def test_a_tube_holds_2000_rollouts_of_the_plain_function(name):
 def test_cells_are_never_taken_for_states(name):
     # As many cells as states, disturbances, or one more: whatever indexes the wrong dimension would fit.
     step, whole = RIGHT[name], reach(RIGHT[name], START, DISTURBANCE, K)
-    states = rollouts(widened(step), count=400, vectorised=takes_batches(step, name))
+    states = rollouts(plain(name), count=400)
     for partitions in (2, 3, 4, [1, 3, 1], "2x2x2"):
         tube = reach(step, START, DISTURBANCE, K, partitions=partitions, cells_at_once=3)
         assert bool(tube.contains(states).all())
@@ -382,7 +390,7 @@ def test_cells_are_never_taken_for_states(name):
 def test_every_propagator_takes_a_strangers_loop(name, propagator):
     step = RIGHT[name]
     tube = reach(step, START, DISTURBANCE, K, propagator=propagator, partitions=2)
-    states = rollouts(widened(step), count=300, vectorised=takes_batches(step, name))
+    states = rollouts(plain(name), count=300)
     assert bool(tube.contains(states).all())
 
 
@@ -391,9 +399,9 @@ def test_auto_lirpa_takes_a_strangers_loop():
         find()
     except UsageError as error:
         pytest.skip(str(error))
-    step = RIGHT["tanh network, float32"]
-    tube = reach(step, START, DISTURBANCE, 3, propagator="auto_lirpa")
-    states = rollouts(widened(step), count=300, horizon=3, vectorised=True)
+    name = "tanh network, float32"
+    tube = reach(RIGHT[name], START, DISTURBANCE, 3, propagator="auto_lirpa")
+    states = rollouts(plain(name), count=300, horizon=3)
     assert bool(tube.contains(states).all())
 
 

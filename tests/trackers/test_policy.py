@@ -44,11 +44,11 @@ def test_folding_is_exact_in_rational_arithmetic(make_tracker):
     weight, bias = (part.detach() for part in tracker.folded(window.double()))
     first, scale = tracker.layers[0], [Fraction(float(s)) for s in tracker.error_scale]
     for row in range(8):
-        exact = Fraction(float(first.bias[row]))
+        exact = Fraction(first.bias[row].item())
         for j in range(3):
             for i in range(4):
                 error = Fraction(float(window[j, i])) - Fraction(float(x[i]))
-                exact += Fraction(float(first.weight[row, 4 * j + i])) * scale[i] * error
+                exact += Fraction(first.weight[row, 4 * j + i].item()) * scale[i] * error
         assert Fraction(float(weight[row] @ x.double() + bias[row])) == exact
 
 

@@ -96,7 +96,10 @@ def test_training_with_it_narrows_the_tube(unicycle, references, start, disturba
 def test_an_exploding_tube_has_a_finite_loss_and_gradient(unicycle, references, start, disturbance, make_tracker):
     tracker = make_tracker(control_scale=[1e4, 1e4])
     value, figures = loss_of(TubeLoss(references=1, counts=[1, 1]), tracker, unicycle, references, start, disturbance)
-    assert torch.isfinite(value) and figures["width"] <= 1e9
+    value.backward()
+    assert torch.isfinite(value) and figures["width"] == 1e6
+    assert all(bool(torch.isfinite(p.grad).all()) for p in tracker.parameters())
+    assert any(bool((p.grad != 0).any()) for p in tracker.parameters()), "the steps before it exploded still teach"
 
 
 def test_a_wrong_share_is_refused():
