@@ -264,9 +264,7 @@ def _references(recipe: Recipe, dynamics: Dynamics, scene: Scene, progress: Prog
     return torch.from_numpy(np.stack(found))
 
 
-def _train(
-    recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None
-) -> None:
+def _train(recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None) -> None:
     options = {k: v for k, v in recipe.training.items() if k not in ("warm_up", "tube_steps")}
     last = {"tube": None if recipe.tube is None else TubeLoss(**recipe.tube)}
     last |= {k: v for k, v in recipe.training.items() if k == "tube_steps"}

@@ -32,6 +32,8 @@ def parse_partitions(value: Any, uncertain_dims: int, *, auto: bool = False) -> 
     Raises:
         ConfigError: anything else, e.g. 0 or "4x".
     """
+    if uncertain_dims < 1:
+        raise ConfigError("partitions: the start box is a single point, there is nothing to partition")
     if auto and isinstance(value, str) and value.strip() == AUTO:
         return None
     example = f"{uncertain_dims} counts such as {'x'.join(['2'] * uncertain_dims)}"

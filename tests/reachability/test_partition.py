@@ -58,3 +58,8 @@ def test_cells_cover_every_start_box_and_leave_certain_dimensions_alone():
 def test_a_count_for_each_uncertain_dimension_is_needed():
     with pytest.raises(ConfigError, match="one count for each of 1 uncertain dimensions"):
         partition(Box.around([0.0, 0.0], [1.0, 0.0]), [2, 2])
+
+
+def test_a_point_cannot_be_partitioned():
+    with pytest.raises(ConfigError, match="single point"):
+        parse_partitions(4, 0)
