@@ -33,16 +33,25 @@ class PlainForm(Form):
     def dim(self) -> int:
         return self.center.dim()
 
+    def _rows(self) -> Tensor:
+        batch = self.frame.batch
+        return self.coefficients.reshape(self.coefficients.shape[0], *batch, -1).movedim(0, -1)
+
     def spread(self) -> Tensor:
         """Rows in terms of all symbols, ``(*batch, events, symbols)``."""
-        batch, generators = self.frame.batch, self.frame.generators
-        rows = self.coefficients.reshape(self.coefficients.shape[0], *batch, -1).movedim(0, -1)
+        rows, generators = self._rows(), self.frame.generators
         n = generators.shape[-2]
         own = rows[..., n:] * self.frame.own_radius[: rows.shape[-1] - n]
         return torch.cat([rows[..., :n] @ generators, own], dim=-1)
 
+    def radius(self) -> Tensor:
+        rows, generators = self._rows(), self.frame.generators
+        n = generators.shape[-2]
+        own = (rows[..., n:].abs() * self.frame.own_radius[: rows.shape[-1] - n]).sum(-1)
+        return ((rows[..., :n] @ generators).abs().sum(-1) + own).reshape(self.shape)
+
     def relaxed(self, name: str, operation: Operation, *parameters: Any) -> PlainForm:
-        radius = self.spread().abs().sum(-1).reshape(self.shape)
+        radius = self.radius()
         slope, offset, error = operation.band(self.center - radius, self.center + radius, *parameters)
         return self.with_fresh(self.center * slope + offset, self.coefficients * slope, error)
 
@@ -66,7 +75,7 @@ class PlainForm(Form):
 class _Frame:
     def __init__(self, generators: Tensor, disturbance_radius: Tensor) -> None:
         self.generators, self.batch = generators, generators.shape[:-2]
-        self.own_radius = torch.cat([disturbance_radius, disturbance_radius.new_ones(1024)])
+        self.own_radius = torch.cat([disturbance_radius, disturbance_radius.new_ones(256)])
         self.size = generators.shape[-2] + disturbance_radius.shape[-1]
 
     def inputs(self, center: Tensor, w_center: Tensor) -> tuple[PlainForm, PlainForm]:
@@ -141,7 +150,7 @@ def stack(values: Sequence[PlainForm], dim: int = -1) -> PlainForm:
     )
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def propagate(loop: Loop, start: Box, disturbance: Box) -> Tube:
     """The tube in plain float64."""
     center, generators = start.center, torch.diag_embed(start.radius)

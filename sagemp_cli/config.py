@@ -158,7 +158,7 @@ def _check_override(override: Any, before: Mapping[str, Any]) -> None:
         raise ConfigError(f"{key} is a section, found {new!r}; its keys: {', '.join(old)}")
 
 
-_OWN_CHECK = ("scene", "verify.partitions")
+_OWN_CHECK = ("scene", "verify.partitions", "verify.memory", "verify.budget")
 """Keys that take values of several types and are checked where they are read."""
 
 

@@ -33,7 +33,7 @@ Partitions = Annotated[
     str | None,
     typer.Option(
         metavar="CELLS",
-        help="Cells of the start box: a total (4) or counts per uncertain dimension (2x2).",
+        help="Cells of the start box: a total (4), counts per uncertain dimension (2x2), or auto: split where needed.",
         show_default=False,
     ),
 ]

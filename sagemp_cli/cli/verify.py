@@ -15,6 +15,8 @@ EXAMPLES = examples(
     "sagemp verify",
     "sagemp verify experiment=unicycle_node --partitions 4",
     "sagemp verify --partitions 2x2 propagator=auto_lirpa --overwrite",
+    "sagemp verify --partitions auto verify.budget=100",
+    "sagemp verify verify.file=plans.npz executor=processes",
     "sagemp verify --json | jq .verdict",
 )
 
@@ -31,7 +33,9 @@ def verify(
     """Prove that the closed loop stays safe and reaches the goal, or find a counterexample.
 
     Reads planner.h5 and tracker.h5, writes certificate.h5 and prints the verdict. If there is a certificate of
-    exactly this config already, its verdict is printed. Exit code: 0 certified, 10 falsified, 5 unknown.
+    exactly this config already, its verdict is printed. With verify.file=FILE all references of an HDF5 or NPZ file
+    are verified instead of the planner's. An interrupted run goes on from its finished cells. Exit code: 0 certified,
+    10 falsified, 5 unknown.
     """
     from sagemp_cli.cli import verdict
     from sagemp_cli.stages.freshness import Freshness, survey

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from itertools import islice
-
-import torch
 
 from sagemp_cli.errors import ConfigError, ResourceError
 from sagemp_cli.experts.problems import Demonstration, Expert, Problem, solve_problem
+from sagemp_cli.workers import be_a_worker, one_thread_per_child
 
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _expert: Expert | None = None  # a worker's own copy, sent once when it starts
 
 
@@ -59,7 +54,7 @@ def _solve(todo: list[Problem], expert: Expert, processes: int) -> Iterator[Demo
     )
     try:
         waiting = iter(todo)
-        with _one_thread_per_child():  # the first submissions start the processes, which inherit the variables
+        with one_thread_per_child():  # the first submissions start the processes, which inherit the variables
             running = {pool.submit(_solve_in_worker, problem) for problem in islice(waiting, 2 * processes)}
         while running:
             finished, running = wait(running, return_when=FIRST_COMPLETED)
@@ -77,25 +72,9 @@ def _solve(todo: list[Problem], expert: Expert, processes: int) -> Iterator[Demo
 
 def _start_worker(expert: Expert) -> None:
     global _expert
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
+    be_a_worker()
     _expert = expert
 
 
 def _solve_in_worker(problem: Problem) -> Demonstration:
     return solve_problem(problem, _expert)
-
-
-@contextmanager
-def _one_thread_per_child() -> Iterator[None]:
-    """Two processes with default threads on two cores run many times slower than with one thread each."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

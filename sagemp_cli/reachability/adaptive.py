@@ -3,7 +3,8 @@
 A partition begins with one cell per reference. In each round every cell whose tube is not SAFE by itself is halved in
 each uncertain dimension for trial, all trials of all references in one batch, and the dimension is kept whose two
 halves together miss least. Rounds go on until all is SAFE, the budget is spent, or it is plain that a reference will
-not be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
+not be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face
+exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
 """
 
 from __future__ import annotations

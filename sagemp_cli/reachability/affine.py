@@ -120,9 +120,10 @@ class Affine:
             frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
             after = loop.step(k, frame.state(center), frame.disturbance(w_center))
             bands.append(frame.bands)
-            if keep_steps:
-                kept_steps.append(after)
             center, generators = _advance(after)
+            if keep_steps:
+                frame.condense()
+                kept_steps.append(after)
             if self.symbols is not None:
                 generators, mask = reduce_generators(generators, self.symbols)
                 masks.append(mask)

@@ -122,6 +122,8 @@ class StepFrame:
         size: number of variables so far.
         relaxations: the nonlinear operations of this step, in the order of evaluation.
         hints: bounds of their inputs, intersected with what the forms give.
+        ellipsoid: after :meth:`condense`, the shape matrix of the symbols, scaled to the extent of the set's box,
+            ``(*batch, n, n)``; no enclosure, but enough where a guess is.
     """
 
     def __init__(
@@ -137,6 +139,7 @@ class StepFrame:
         self.batch = generators.shape[:-2]
         self.relaxations: list[Relaxed] = []
         self.hints = hints
+        self.ellipsoid: Tensor | None = None
 
     @property
     def bands(self) -> list[tuple[str, Band]]:
@@ -152,6 +155,13 @@ class StepFrame:
     def sum_error(self) -> float:
         """Relative error (gamma) of sums over all symbols and of the products with the generators."""
         return 2 * (self.generators.shape[-1] + self.size + 64) * UNIT
+
+    def condense(self) -> None:
+        """Give up the generators, most of a kept step, for an ellipsoid: no forms are made after this."""
+        square = self.generators @ self.generators.mT
+        scale = self.reach / (square.diagonal(dim1=-2, dim2=-1).sqrt() + TINY)
+        self.ellipsoid = square * scale[..., None] * scale[..., None, :]
+        self.generators = self.generators[..., :0].clone()
 
     def own_radius(self, count: int) -> Tensor:
         """Radii of the first ``count`` variables after the state: the disturbance's, then ones."""
@@ -483,7 +493,9 @@ def _product(a: AffineForm, b: AffineForm) -> AffineForm:
             factors=factors,
         )
     )
-    return AffineForm(frame, center, coefficients, magnitude, error)._with_fresh(center, coefficients, magnitude, radius)
+    return AffineForm(frame, center, coefficients, magnitude, error)._with_fresh(
+        center, coefficients, magnitude, radius
+    )
 
 
 @handles(torch.nn.functional.linear)

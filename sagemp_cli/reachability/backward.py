@@ -29,10 +29,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine_form import AffineForm, Relaxed, StepFrame
+from sagemp_cli.reachability.affine_form import AffineForm, Relaxed
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT
 
 _SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and error factors themselves
+_LINEAR = 1e-9  # a band this narrow, relative to the values, is rounding only
 _LEAD = 2  # columns before the coefficients: what is gained, and the magnitude
 
 
@@ -69,6 +70,8 @@ class Replacement(NamedTuple):
         lines: from positive and negative parts of their coefficients to gain, magnitude and earlier coefficients,
             ``(*batch, 2E, 2 + first)``.
         input: the operation's input (and minus it) as such rows, ``(*batch, 2E, 2 + first)``; None for a product.
+        chosen: the entries in ``input``: those where the function is not linear on the interval, in any cell or step;
+            nothing is gained by bounding the others once more.
         product: planes instead of lines.
     """
 
@@ -77,6 +80,7 @@ class Replacement(NamedTuple):
     inverse: Tensor
     lines: Tensor
     input: Tensor | None
+    chosen: Tensor | None = None
     product: Product | None = None
 
 
@@ -182,7 +186,7 @@ def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, 
     upper = rows[..., 0] + reach[..., 0] * (1.0 + (2 * n + 8) * UNIT)
     upper = upper + (upper.abs() + reach[..., 0]) * (4 * UNIT)
     upper = torch.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=math.inf)
-    return _collected(upper, joined, targets, [len(steps[k].replacements) - 1 for k in targets])
+    return _collected(upper, joined, targets, steps)
 
 
 def _split(rows: Tensor) -> Tensor:
@@ -222,17 +226,22 @@ def _tilted(parts: Tensor, product: Product, likely: Tensor) -> Tensor:
     return torch.cat([gain, passed, weights @ product.tilts], dim=-1)
 
 
-def _collected(upper: Tensor, joined: list[tuple[int, int, int]], targets: range, operations: list[int]) -> Bounds:
+def _collected(upper: Tensor, joined: list[tuple[int, int, int]], targets: range, steps: Sequence[Step]) -> Bounds:
     """Upper bounds of rows and of minus the rows, as lower and upper bounds by step and operation."""
     states: list[Any] = [None] * len(targets)
-    inputs: list[list[Any]] = [[None] * count for count in operations]
+    inputs: list[list[Any]] = [[None] * (len(steps[k].replacements) - 1) for k in targets]
     pieces = upper.split([count for *_, count in joined], dim=-1)
     for (k, i, _), piece in zip(joined, pieces, strict=True):
         high, low = piece.chunk(2, dim=-1)
         if i < 0:
             states[k - targets.start] = (-low, high)
         else:
-            inputs[k - targets.start][i] = (-low, high)
+            r = steps[k].replacements[i + 1]
+            unknown = high.new_full((*high.shape[:-1], r.last - r.first), math.inf)
+            inputs[k - targets.start][i] = (
+                (-unknown).index_copy(-1, r.chosen, -low),
+                unknown.index_copy(-1, r.chosen, high),
+            )
     lower, higher = (torch.stack(side, dim=-2) for side in zip(*states, strict=True))
     return Bounds((lower, higher), inputs)
 
@@ -273,7 +282,7 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
         yield Step(
             output[k],
             tuple(_at(r, k) for r in stacked),
-            _ellipsoid(steps[k].frame),
+            steps[k].frame.ellipsoid,
             steps[k].frame.own_radius(frame.size - n),
             rounding,
         )
@@ -281,16 +290,9 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
 
 def _at(stacked: Replacement, k: int) -> Replacement:
     """The k-th of stacked replacements."""
-    first, last, inverse, lines, own, product = stacked
+    first, last, inverse, lines, own, chosen, product = stacked
     planes = None if product is None else Product(*(part[k] for part in product))
-    return Replacement(first, last, inverse[k], lines[k], None if own is None else own[k], planes)
-
-
-def _ellipsoid(frame: StepFrame) -> Tensor:
-    """Shape matrix of the state set's symbols, scaled to the extent of its box."""
-    square = frame.generators @ frame.generators.mT
-    scale = frame.reach / (square.diagonal(dim1=-2, dim2=-1).sqrt() + TINY)
-    return square * scale[..., None] * scale[..., None, :]
+    return Replacement(first, last, inverse[k], lines[k], None if own is None else own[k], chosen, planes)
 
 
 def _kept(radius: Tensor, first: int) -> Replacement:
@@ -341,12 +343,14 @@ def _replacement(group: list[Relaxed], batch: torch.Size, steps: int) -> Replace
     lead = torch.stack([value, tilt.abs() * twice + value.abs()], dim=-1)
     lines = torch.cat([lead, tilt[..., None] * torch.cat([coefficients, coefficients], dim=-2)], dim=-1)
     carried = magnitude * (error * _SAFETY)
+    chosen = (radius > _LINEAR * (slope.abs() * magnitude + offset.abs())).flatten(0, -2).any(0).nonzero()[:, 0]
     return Replacement(
         r.first,
         r.first + radius.shape[-1],
         (1.0 / radius)[..., None, :],
         lines,
-        _signed(carried, magnitude, coefficients),
+        _signed(carried[..., chosen], magnitude[..., chosen], coefficients[..., chosen, :]),
+        chosen,
     )
 
 

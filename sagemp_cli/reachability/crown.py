@@ -28,8 +28,8 @@ from sagemp_cli.sets import Box, Tube
 class Crown:
     """Backward linear bounds, rounding included.
 
-    Memory per cell, in float64 numbers: of the order of ``K (v^2 + n M)`` for the recorded steps, with v variables a
-    step (states, disturbances, one per relaxed entry) and M generators, and ``5 v rows`` for the sweep.
+    Memory per cell, in float64 numbers: of the order of ``3 K v^2`` for the recorded steps, with v variables a
+    step (states, disturbances, one per relaxed entry), and ``5 v rows`` for the sweep.
 
     Attributes:
         symbols: most generators that the forward pass keeps between steps (None: all).

@@ -132,6 +132,19 @@ class Verification:
         )
 
 
+def require_references(references: Tensor, dynamics: Dynamics) -> None:
+    """Raise unless references are ``(R, K+1, n)`` with R >= 1 and finite.
+
+    Raises:
+        UsageError: another shape.
+        NonFiniteError: a NaN or an infinity.
+    """
+    n = dynamics.state_dim
+    if references.dim() != 3 or references.shape[-1] != n or references.shape[1] < 2 or not len(references):
+        raise UsageError(f"references must have shape (count, K+1, {n}), found {tuple(references.shape)}")
+    require_finite(references, dynamics.state_names)
+
+
 def require_finite(references: Tensor, state_names: Sequence[str]) -> None:
     """Raise a :class:`NonFiniteError` naming reference, step and state if a reference has a NaN or an infinity."""
     bad = torch.nonzero(~torch.isfinite(references))
@@ -181,11 +194,8 @@ def verify_references(
         NonFiniteError: a reference contains NaN or infinity.
         UsageError: shapes that do not fit, or no references.
     """
-    n = dynamics.state_dim
-    if references.dim() != 3 or references.shape[-1] != n or not len(references):
-        raise UsageError(f"references must have shape (count, K+1, {n}), found {tuple(references.shape)}")
-    require_finite(references, dynamics.state_names)
-    count = references.shape[0]
+    require_references(references, dynamics)
+    count, n = references.shape[0], dynamics.state_dim
     references = references.to(torch.float64)
     start = Box(start.lower.expand(count, n), start.upper.expand(count, n))
     prover = CellProver(propagator, dynamics, tracker, disturbance)

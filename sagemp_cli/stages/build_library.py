@@ -7,18 +7,16 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from sagemp_cli.binding import build
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.library import REASONS, build_library
 from sagemp_cli.models import planner_from, tracker_from
-from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
-from sagemp_cli.reachability.verification import verify_references
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.library import draw_library
 from sagemp_cli.sets import Box
 from sagemp_cli.stages.options import whole_number
 from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.proof import Proof
 from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Library
@@ -32,8 +30,7 @@ def run(context: StageContext) -> Path:
     spread = section["start_spread"]
     if not isinstance(spread, int | float) or not 0 <= spread <= 1:
         raise ConfigError(f"library.start_spread must be a share of X_I in [0, 1], found {spread!r}")
-    counts = parse_partitions(context.config["verify"]["partitions"], len(uncertain_dimensions(problem.start)))
-    propagator = build(context.config["propagator"], "propagator")
+    proof = Proof.of(context.config, problem)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
 
@@ -48,16 +45,7 @@ def run(context: StageContext) -> Path:
 
     made = build_library(
         draw,
-        lambda references: verify_references(
-            propagator,
-            problem.dynamics,
-            tracker=tracker,
-            scene=problem.scene,
-            references=references,
-            start=problem.start,
-            disturbance=problem.disturbance,
-            counts=counts,
-        ),
+        lambda references: proof.verify(references, tracker),
         scene=problem.scene,
         position=problem.dynamics.position,
         wanted=wanted,

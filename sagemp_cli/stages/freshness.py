@@ -67,7 +67,9 @@ def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileStat
             raise ArtifactError(f"{path}: is an artifact of kind '{kind.name}', '{wanted.name}' is needed here")
     except ArtifactError as e:
         return FileState(stage, path, Freshness.DAMAGED, str(e).removeprefix(f"{path}: "))
-    why = _config_change(stage, header, context) or _input_change(stage, header, before)
+    why = (
+        _config_change(stage, header, context) or _input_change(stage, header, before) or _file_change(header, context)
+    )
     return FileState(stage, path, Freshness.STALE if why else Freshness.FRESH, why, header, sha256_of(path))
 
 
@@ -90,4 +92,14 @@ def _input_change(stage: Stage, header: Header, before: Mapping[str, FileState])
             return f"it does not say which {source.path.name} it was made from"
         if recorded[source.stage.role] != source.sha256:
             return f"its input {source.path.name} has changed since"
+    return ""
+
+
+def _file_change(header: Header, context: StageContext) -> str:
+    """Of files that no stage made, e.g. one of references; one that is gone cannot contradict what was made from it."""
+    for parent in header.parents:
+        source = context.folder / parent.path
+        foreign = parent.role not in {stage.role for stage in STAGES}
+        if foreign and source.exists() and sha256_of(source) != parent.sha256:
+            return f"{source.name} has changed since"
     return ""

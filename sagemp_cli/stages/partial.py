@@ -50,9 +50,12 @@ class PartialResults:
     folder: Path
 
     @classmethod
-    def of(cls, context: StageContext, stage: str, *, without: Sequence[str] = ()) -> PartialResults:
-        """Open the pieces of a stage, dropping those that a changed config has made stale."""
-        return cls(_folder_of_its_own(context.partial_folder(stage), work_identity(context, stage, without=without)))
+    def of(
+        cls, context: StageContext, stage: str, *, without: Sequence[str] = (), parents: Sequence[Parent] = ()
+    ) -> PartialResults:
+        """Open the pieces of a stage, dropping those that a changed config or input has made stale."""
+        identity = work_identity(context, stage, without=without, parents=parents)
+        return cls(_folder_of_its_own(context.partial_folder(stage), identity))
 
     @property
     def finished(self) -> set[int]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from sagemp_cli.binding import all_complaints, option_complaints, target_class
+from sagemp_cli.binding import all_complaints, build, option_complaints, target_class
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
 from sagemp_cli.experts import Expert, Weights
 from sagemp_cli.planners import train_planner
-from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
+from sagemp_cli.reachability.partition import uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.proof import partition_complaints
 from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
@@ -20,7 +21,7 @@ _RUN = ("generator", "checkpoint", "identity", "progress")
 """Arguments of everything that trains or searches, which the stages give."""
 
 _KEYS = {
-    "verify": ("partitions", "references", "falsifier"),
+    "verify": ("partitions", "budget", "memory", "references", "file", "falsifier"),
     "library": ("size", "budget", "start_spread"),
     "execute": ("queries", "rollouts"),
     "start": ("center", "radius"),
@@ -84,11 +85,12 @@ def _problem_complaints(config: Mapping[str, Any]) -> list[str]:
         problem = problem_of(config)
     except UsageError as e:
         return [str(e)]
+    found = partition_complaints(config["verify"], len(uncertain_dimensions(problem.start)))
     try:
-        parse_partitions(config["verify"]["partitions"], len(uncertain_dimensions(problem.start)))
-    except UsageError as e:
-        return [f"verify.{e}"]
-    return []
+        build(config["executor"], "executor")
+    except ConfigError as e:
+        found.append(str(e))
+    return found
 
 
 def _without(section: Mapping[str, Any], *keys: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from sagemp_cli.storage import (
     Demonstrations,
     Header,
     Library,
+    Parent,
     PlannerModel,
     Rollouts,
     TrackerModel,
@@ -64,6 +65,8 @@ class Stage:
 
 
 _ROBOT = ("name", "dynamics", "scene", "horizon")
+# Memory decides which cells are propagated together, which changes the last bits of their tubes.
+_PARTITION = ("verify.partitions", "verify.budget", "verify.memory")
 
 STAGES = (
     Stage("gen-data", "demonstrations.h5", Demonstrations, (), (*_ROBOT, "expert", "start", "seed")),
@@ -87,7 +90,7 @@ STAGES = (
         "library.h5",
         Library,
         ("train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", "verify.partitions", "library", "start", "disturbance", "seed"),
+        (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance", "seed"),
     ),
     Stage(
         "execute",
@@ -186,14 +189,20 @@ class StageContext:
                 )
         return artifact
 
-    def write(self, stage: str, record: Any, parents: tuple[Artifact[Any], ...] = ()) -> Path:
-        """Write a stage's output with its provenance."""
+    def write(
+        self,
+        stage: str,
+        record: Any,
+        parents: tuple[Artifact[Any], ...] = (),
+        files: tuple[Parent, ...] = (),
+    ) -> Path:
+        """Write a stage's output with its provenance: the artifacts and other files that it was made from."""
         header = Header(
             stage=stage,
             experiment=str(self.config["name"]),
             config=self.config,
             seed=self.seed,
-            parents=tuple(p.as_parent(p.path.stem, self.folder) for p in parents),
+            parents=(*(p.as_parent(p.path.stem, self.folder) for p in parents), *files),
             seconds=time.monotonic() - self.started,
             device=str(self.config["device"]),
         )

@@ -1,61 +1,61 @@
-"""``sagemp verify``: references of the planner, their tubes, the verdict, and an attack on it."""
+"""``sagemp verify``: references of the planner or of a file, their tubes, the verdict, and an attack on it."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-from sagemp_cli.binding import build
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.reachability.falsifier import Counterexample as Found
-from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.reachability.verdict import answer_of
-from sagemp_cli.reachability.verification import verify_references
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.proof import Proof
+from sagemp_cli.stages.reference_file import REFERENCES, read_references
 from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.tubes import tubes_record
-from sagemp_cli.storage import Certificate, Counterexample
+from sagemp_cli.storage import Certificate, Counterexample, Parent, sha256_of
 
 
 def run(context: StageContext) -> Path:
-    """Sample references at x_I, prove what can be proved, try to refute the rest."""
+    """Sample or read references, prove what can be proved, try to refute the rest.
+
+    Finished chunks of cells are kept until the certificate is written: an interrupted run goes on from there.
+    """
     problem, section = problem_of(context.config), context.config["verify"]
-    counts = parse_partitions(section["partitions"], len(uncertain_dimensions(problem.start)))
+    proof = Proof.of(context.config, problem)
     count = whole_number(section["references"], "verify.references")
     search = section.get("falsifier") or {}
     given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
     search = options_for(attack, search, "verify.falsifier", given=given)
     for key, value in search.items():
         whole_number(value, f"verify.falsifier.{key}", least=1 if key == "at_once" else 0)
-    propagator = build(context.config["propagator"], "propagator")
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
-    planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
-
-    references = planner.sample(
-        problem.start.center,
-        problem.scene.goal,
-        scene=problem.scene,
-        count=count,
-        generator=context.generator("verify: references"),
-    )
-    if references.shape[1] != problem.horizon + 1:
-        found = references.shape[1] - 1
-        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {found} steps")
-    verification = verify_references(
-        propagator,
-        problem.dynamics,
-        tracker=tracker,
-        scene=problem.scene,
-        references=references,
-        start=problem.start,
-        disturbance=problem.disturbance,
-        counts=counts,
-        progress=context.progress,
-    )
+    tracker = tracker_from(tracker_file)
+    files: tuple[Parent, ...] = ()
+    if section["file"] is None:
+        references = planner_from(planner_file).sample(
+            problem.start.center,
+            problem.scene.goal,
+            scene=problem.scene,
+            count=count,
+            generator=context.generator("verify: references"),
+        )
+        if references.shape[1] != problem.horizon + 1:
+            found = references.shape[1] - 1
+            raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {found} steps")
+    else:
+        file = Path(section["file"])
+        references = read_references(file, horizon=problem.horizon, state_names=problem.dynamics.state_names)
+        files = (Parent(REFERENCES, os.path.relpath(file, context.folder), sha256_of(file)),)
+    parents = (*(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file)), *files)
+    pieces = PartialResults.of(context, "verify", without=("verify.falsifier",), parents=parents)
+    verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     refutation = attack(
         verification,
         problem.dynamics,
@@ -73,7 +73,8 @@ def run(context: StageContext) -> Path:
         falsifier_rollouts=refutation.rollouts,
         verdict=str(answer_of(refutation.verification.verdicts)),
     )
-    path = context.write("verify", record, (planner_file, tracker_file))
+    path = context.write("verify", record, (planner_file, tracker_file), files)
+    pieces.remove()
     draw_beside(path, draw_certificate, context.read("verify"))
     return path
 

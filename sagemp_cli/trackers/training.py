@@ -47,7 +47,7 @@ class RolloutSampler:
     spread: Tensor
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """References ``(count, K+1, n)`` from their first step on, starts ``(count, n)``, disturbances ``(count, H, n)``."""
+        """References ``(count, K+1, n)`` from the drawn step, starts ``(count, n)``, disturbances ``(count, H, n)``."""
         total, horizon = self.references.shape[0], self.references.shape[1] - 1
         chosen = torch.randint(total, (count,), generator=generator)
         shift = torch.randint(max(1, horizon - self.length // 2), (count,), generator=generator)

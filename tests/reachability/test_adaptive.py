@@ -17,7 +17,7 @@ from sagemp_cli.trackers.policy import Tracker
 
 
 class Stretched:
-    """Tubes whose width is that of the cell times a factor per dimension; SAFE if narrow enough; remembers its calls."""
+    """Tubes whose width is that of the cell times a factor per dimension; SAFE if narrow enough."""
 
     def __init__(self, factors, limit=1.0, floor=0.0):
         self.factors, self.limit, self.floor = torch.tensor(factors, dtype=torch.float64), limit, floor

@@ -36,6 +36,15 @@ def test_wrong_partitions_are_refused_with_what_is_allowed(value):
         parse_partitions(value, 2)
 
 
+def test_auto_is_allowed_where_asked_for_only():
+    assert parse_partitions("auto", 2, auto=True) is None
+    assert parse_partitions("2x1", 2, auto=True) == [2, 1]
+    with pytest.raises(ConfigError, match="cells in all, 2 counts such as 2x2, or auto; found 'Auto'"):
+        parse_partitions("Auto", 2, auto=True)
+    with pytest.raises(ConfigError, match="cells in all, or 2 counts such as 2x2; found 'auto'"):
+        parse_partitions("auto", 2)
+
+
 def test_counts_for_the_wrong_number_of_dimensions_are_refused():
     with pytest.raises(ConfigError, match="found 3 counts in '2x2x2'"):
         parse_partitions("2x2x2", 2)

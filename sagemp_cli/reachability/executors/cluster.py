@@ -72,7 +72,8 @@ def _shared_out(client: Any, prover: CellProver, chunks: Sequence[Chunk]) -> Ite
         return client.submit(_prove, prover, chunk.index, chunk.arrays(), pure=False)
 
     waiting = iter(chunks)
-    running = as_completed([submit(chunk) for chunk in islice(waiting, max(4, 2 * sum(client.nthreads().values())))])
+    ahead = max(4, 2 * sum(client.nthreads().values()))
+    running = as_completed([submit(chunk) for chunk in islice(waiting, ahead)], loop=client.loop)
     for future in running:
         index, arrays = future.result()
         for chunk in islice(waiting, 1):

@@ -8,7 +8,7 @@ from torch import Tensor
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
-from sagemp_cli.reachability.relaxations.value_range import increasing
+from sagemp_cli.reachability.relaxations.value_range import increasing, outward
 
 
 def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None = None) -> Band:
@@ -35,8 +35,13 @@ def lines(lower: Tensor, upper: Tensor, negative_slope: float) -> Lines:
 
 
 def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Tensor, Tensor]:
-    """Bounds on ``[lower, upper]``, ``0 <= s``: monotone, so the values at the ends."""
-    return increasing(lambda x: torch.nn.functional.leaky_relu(x, negative_slope), lower, upper, ulps=1)
+    """Bounds on ``[lower, upper]``: monotone for ``s >= 0``; V-shaped for ``s < 0``, least at the kink."""
+    leaky = torch.nn.functional.leaky_relu
+    if negative_slope >= 0:
+        return increasing(lambda x: leaky(x, negative_slope), lower, upper, ulps=1)
+    ends = torch.stack([leaky(lower, negative_slope), leaky(upper, negative_slope)])
+    least = torch.where((lower <= 0) & (upper >= 0), torch.zeros_like(lower), ends.amin(0))
+    return outward(least, ends.amax(0), ulps=1)
 
 
 def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,19 @@
+"""The range of a leaky ReLU whose negative slope is negative too: V-shaped, not monotone."""
+
+import pytest
+import torch
+
+from sagemp_cli.reachability.relaxations.leaky_relu import value_range
+
+
+@pytest.mark.parametrize("slope", [-2.0, -1.0, -0.1, 0.0, 0.1, 1.0])
+def test_the_range_holds_every_value(slope):
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.randn(2, 500, dtype=torch.float64, generator=generator).sort(0).values
+    low, high = value_range(ends[0], ends[1], slope)
+    share = torch.linspace(0, 1, 101, dtype=torch.float64)[:, None]
+    inside = (ends[0] + share * (ends[1] - ends[0])).clamp(ends[0], ends[1])
+    points = torch.cat([inside, torch.zeros_like(ends[:1]).clamp(ends[0], ends[1])])
+    values = torch.nn.functional.leaky_relu(points, slope)
+    assert bool((low <= values.amin(0)).all()) and bool((values.amax(0) <= high).all())
+    assert bool((high - values.amax(0) < 1e-12).all()) and bool((values.amin(0) - low < 1e-12).all())
