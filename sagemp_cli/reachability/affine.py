@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+import sagemp_cli.reachability.affine_operations  # noqa: F401  (gives the forms their operations)
 import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError

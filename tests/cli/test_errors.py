@@ -19,7 +19,7 @@ FOLDER = Path("artifacts/unicycle_node")
     ("arguments", "message"),
     [
         (["verify", "--partitions", "0"], "verify.partitions must be a positive number of cells in all"),
-        (["verify", "--partitions", "4x"], "or 2 counts such as 2x2; found '4x'"),
+        (["verify", "--partitions", "4x"], "2 counts such as 2x2, or auto; found '4x'"),
         (["verify", "--partitions", "it's"], 'found "it\'s"'),
         (["verify", "--partitions", "-4"], "found -4"),
         (
