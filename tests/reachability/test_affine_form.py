@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional
 
-import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
+import sagemp_cli.reachability.affine_operations
+import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (both register what forms can do)
 from sagemp_cli.errors import UnsupportedOperationError
 from sagemp_cli.reachability.affine_form import AffineForm, StepFrame
 
@@ -239,9 +240,9 @@ def test_a_form_whose_errors_are_shrunk_is_caught(name, monkeypatch):
         return float(values.min()) < float(low) - 1e-12 or float(values.max()) > float(high) + 1e-12
 
     assert not escaped()
-    honest = AffineForm._with_fresh
+    honest = AffineForm.with_fresh
     monkeypatch.setattr(
-        AffineForm, "_with_fresh", lambda self, c, g, magnitude, radius: honest(self, c, g, magnitude, radius * 0.9)
+        AffineForm, "with_fresh", lambda self, c, g, magnitude, radius: honest(self, c, g, magnitude, radius * 0.9)
     )
     assert escaped()
 
