@@ -46,6 +46,12 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
         else:
             lines.append(f"  reference {i}: {item['verdict']} at step {item['step']} ({item['constraint']})")
     lines += [
+        f"  controls: {c['control']} asks for {c['lower']:.3g} to {c['upper']:.3g} {c['unit']}, beyond its limits"
+        f" {c['limits'][0]:.3g} to {c['limits'][1]:.3g}; the proof holds for actuators that follow"
+        for c in data["controls"]
+        if not c["within"]
+    ]
+    lines += [
         f"  counterexample: reference {c['reference']}, {c['kind']} at step {c['step']} ({c['constraint']}),"
         f" {c['depth']:.3g} deep"
         for c in data["counterexamples"]
@@ -83,6 +89,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "cells": len(tubes.cell_reference),
         "certified": sum(v == "SAFE" for v in tubes.verdict),
         "references": references,
+        "controls": _controls(certificate),
         "counterexamples": [
             {"reference": c.reference, "kind": c.kind, "step": c.step, "constraint": c.constraint, "depth": c.depth}
             for c in record.counterexamples
@@ -92,3 +99,35 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "certificate": str(certificate.path),
         "figure": str(figure) if figure.exists() else None,
     }
+
+
+def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
+    """Range of each control over all certified tubes, beside the robot's limits (empty if nothing is certified).
+
+    Nothing in the loop enforces limits: the paper penalises them in training; the proof is about the model as it is.
+    """
+    from sagemp_cli.binding import target_class
+
+    tubes, section = certificate.record.tubes, certificate.header.config["dynamics"]
+    safe = [i for i, verdict in enumerate(tubes.verdict) if verdict == "SAFE"]
+    if not safe:
+        return []
+    robot: Any = target_class(section, "dynamics")
+    lower, upper = tubes.control_lower[safe].min((0, 1)), tubes.control_upper[safe].max((0, 1))
+    ranges = zip(robot.control_names, robot.control_units, lower.tolist(), upper.tolist(), strict=True)
+    return [
+        {
+            "control": name,
+            "unit": unit,
+            "lower": least,
+            "upper": most,
+            "limits": limits,
+            "within": limits[0] <= least and most <= limits[1],
+        }
+        for (name, unit, least, most), limits in zip(
+            ranges,
+            ([*pair] for pair in zip(section["control_lower"], section["control_upper"], strict=True)),
+            strict=True,
+        )
+        if math.isfinite(least) and math.isfinite(most)
+    ]
