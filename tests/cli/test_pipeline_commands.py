@@ -23,12 +23,13 @@ def test_run_makes_everything_in_order_and_ends_with_verdict_certificate_and_fig
     result = sagemp("run")
     assert result.exit_code == 0, result.stderr
     assert made_up.ran == NAMES
-    assert result.stdout.splitlines()[-4:] == [
-        "VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, a text)",
-        "  reference 0: SAFE at all steps, keeps 0.25 m from lower disc",
-        f"certificate {FOLDER}/certificate.h5",
-        f"figure      {FOLDER}/certificate.png",
-    ]
+    lines = result.stdout.splitlines()
+    begin = lines.index("VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, a text)")
+    assert lines[begin + 1] == "  reference 0: SAFE at all steps, keeps 0.25 m from lower disc"
+    # The made-up controls go beyond the robot's limits, and whoever reads the verdict is told.
+    assert lines[begin + 2].startswith("  controls: turn_rate asks for ")
+    assert lines[begin + 2].endswith(" rad/s, beyond its limits -1.5 to 1.5; the proof holds for actuators that follow")
+    assert lines[-2:] == [f"certificate {FOLDER}/certificate.h5", f"figure      {FOLDER}/certificate.png"]
 
 
 def test_run_again_makes_nothing(sagemp, made_up):
