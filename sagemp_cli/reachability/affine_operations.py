@@ -27,7 +27,7 @@ def _frame_of(*values: Any) -> StepFrame:
     return next(v.frame for v in values if isinstance(v, AffineForm))
 
 
-def constant(frame: StepFrame, value: Any, like: Tensor) -> Tensor:
+def constant(value: Any, like: Tensor) -> Tensor:
     """A number or tensor as float64 tensor."""
     return torch.as_tensor(value, dtype=torch.float64, device=like.device)
 
@@ -69,7 +69,7 @@ def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
     if not isinstance(a, AffineForm):
         a, b = b, a
     if not isinstance(b, AffineForm):
-        value = constant(a.frame, b, a.center)
+        value = constant(b, a.center)
         shape = _broadcast(a.shape, value.shape)
         center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
         # Two units: the second is for the rounding of alpha times the constant.
@@ -110,7 +110,7 @@ def multiply(a: Any, b: Any) -> AffineForm:
             return a
         b = float(b)
         return AffineForm(a.frame, a.center * b, a.coefficients * b, a.magnitude * abs(b) + TINY, a.error + UNIT)
-    value = constant(a.frame, b, a.center)
+    value = constant(b, a.center)
     shape = _broadcast(a.shape, value.shape)
     center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
     return AffineForm(a.frame, center * value, coefficients * value, magnitude * value.abs() + TINY, a.error + UNIT)
@@ -125,7 +125,7 @@ def divide(a: Any, b: Any) -> AffineForm:
         # a / b = q + (a - q b) / b for any q: near the centres' quotient what the two share cancels before the product.
         q = (a.center / b.center).detach().nan_to_num(0.0, 0.0, 0.0)
         return add(multiply(subtract(a, multiply(b, q)), torch.reciprocal(b)), q)
-    value = constant(a.frame, b, a.center)
+    value = constant(b, a.center)
     shape = _broadcast(a.shape, value.shape)
     center, coefficients, magnitude = _expand(a, shape, a.coefficients.shape[0])
     return AffineForm(a.frame, center / value, coefficients / value, magnitude / value.abs() + TINY, a.error + 2 * UNIT)

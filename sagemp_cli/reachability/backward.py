@@ -10,7 +10,8 @@ state. With both lines parallel to the band this is affine arithmetic again; lin
 more.
 
 Everything that does not depend on the rows is done once for all steps of equal structure: a replacement is one product
-of the coefficients' positive and negative parts with a fixed matrix.
+of the coefficients' positive and negative parts with a fixed matrix. Building these matrices and sweeping rows through
+them share one layout of variables, which is why they share one (long) file.
 
 Rounding. Each matrix has a column more, with the magnitudes ``|coefficients| |v|`` that pass through it. Their sum T
 bounds every intermediate result, so a step errs by at most ``gamma T`` (Higham 2002, section 3.1; gamma from the
@@ -29,10 +30,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine_form import AffineForm, Relaxed
+from sagemp_cli.reachability.affine_form import SAFETY, AffineForm, Relaxed
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT
 
-_SAFETY = 1.0 + 1e-9  # covers the rounding made in computing magnitudes and error factors themselves
 _LINEAR = 1e-9  # a band this narrow, relative to the values, is rounding only
 _LEAD = 2  # columns before the coefficients: what is gained, and the magnitude
 
@@ -277,7 +277,7 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
     output = _signed(carried, _stack(steps, "magnitude", batch), output)
     # Every product of a step is a sum of twice its entries; 8 more for the factors and for joining it to the rest.
     lengths = [2 * n + 8, *(2 * (r.last - r.first) + 8 for r in stacked)]
-    rounding = sum(lengths) * UNIT * _SAFETY
+    rounding = sum(lengths) * UNIT * SAFETY
     for k in range(len(steps)):
         yield Step(
             output[k],
@@ -327,12 +327,12 @@ def _replacement(group: list[Relaxed], batch: torch.Size, steps: int) -> Replace
     )
     below, low, above, high = _lines(group, radius.shape)
     # The band's error as a function of x: what the input's own rounding does to it is in the last term.
-    own = (slope.abs() * magnitude + offset.abs() + radius) * ((error + 8 * UNIT) * _SAFETY)
+    own = (slope.abs() * magnitude + offset.abs() + radius) * ((error + 8 * UNIT) * SAFETY)
 
     def relative(line_slope: Tensor, line_offset: Tensor, sign: float) -> tuple[Tensor, Tensor]:
         tilt = line_slope - slope
         value = tilt * center + (line_offset - offset)
-        doubt = tilt.abs() * magnitude * ((error + 8 * UNIT) * _SAFETY)
+        doubt = tilt.abs() * magnitude * ((error + 8 * UNIT) * SAFETY)
         doubt = doubt + (line_offset.abs() + offset.abs()) * (8 * UNIT) + own + TINY
         tilt, value = (torch.where(torch.isfinite(value), part, 0.0) for part in (tilt, sign * value + doubt))
         return sign * tilt, torch.where(torch.isfinite(line_offset), value, radius)
@@ -342,7 +342,7 @@ def _replacement(group: list[Relaxed], batch: torch.Size, steps: int) -> Replace
     twice = torch.cat([magnitude, magnitude], dim=-1)
     lead = torch.stack([value, tilt.abs() * twice + value.abs()], dim=-1)
     lines = torch.cat([lead, tilt[..., None] * torch.cat([coefficients, coefficients], dim=-2)], dim=-1)
-    carried = magnitude * (error * _SAFETY)
+    carried = magnitude * (error * SAFETY)
     chosen = (radius > _LINEAR * (slope.abs() * magnitude + offset.abs())).flatten(0, -2).any(0).nonzero()[:, 0]
     return Replacement(
         r.first,
@@ -362,7 +362,7 @@ def _planes(group: list[Relaxed], batch: torch.Size, magnitude: Tensor) -> Produ
     )
     sums, differences = (_rows(factors, batch, name) for name in ("sum", "difference"))
     tilts = torch.cat([differences, sums], dim=-2)
-    own = magnitude * ((2 * r.error + 24 * UNIT) * _SAFETY)
+    own = magnitude * ((2 * r.error + 24 * UNIT) * SAFETY)
     twice = torch.cat([carried, carried], dim=-1)
 
     def both(upper: Tensor, lower: Tensor) -> Tensor:
@@ -376,7 +376,7 @@ def _planes(group: list[Relaxed], batch: torch.Size, magnitude: Tensor) -> Produ
         offset=both(own - middle, own + middle),
         middle=both(middle.abs(), middle.abs()),
         magnitude=twice[..., None, :],
-        rounding=twice[..., None, :] * ((r.error + 8 * UNIT) * _SAFETY),
+        rounding=twice[..., None, :] * ((r.error + 8 * UNIT) * SAFETY),
     )
 
 
