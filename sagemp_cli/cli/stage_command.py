@@ -36,11 +36,11 @@ def run_stage(name: str, overrides: list[str], *, overwrite: bool, dry_run: bool
     from sagemp_cli.stages.freshness import survey
 
     context = context_of(overrides, overwrite=overwrite)
-    states = survey(context)
+    states = survey(context, last=name)
     refuse_existing_output(states[name], overwrite)
-    require_inputs(states, name, overrides)
+    require_inputs(context, states, name, overrides)
     if dry_run:
-        explain(states, name)
+        explain(context, states, name)
         return
     with time_limit(seconds):
         announce(states[name].stage.run(context))
@@ -60,24 +60,27 @@ def refuse_existing_output(state: FileState, overwrite: bool) -> None:
     raise ArtifactError(f"{state.path}: {what}; pass --overwrite to remake it ('sagemp run' skips what is up to date)")
 
 
-def require_inputs(states: dict[str, FileState], name: str, overrides: list[str]) -> None:
+def require_inputs(context: StageContext, states: dict[str, FileState], name: str, overrides: list[str]) -> None:
     """Raise if an input is not there, and say which command makes it."""
     from sagemp_cli.stages.freshness import Freshness
 
-    missing = [s for s in states[name].stage.inputs if states[s].freshness is Freshness.MISSING]
+    read = states[name].stage.inputs_in(context.config)
+    missing = [s for s in read if states[s].freshness is Freshness.MISSING]
     if missing:
         said = "".join(f" {shlex.quote(o)}" for o in overrides)
+        owner = context.owner(missing[0])
+        where = said if owner is context else f" experiment={owner.config['name']}"
         raise ArtifactError(
-            f"{states[missing[0]].path}: missing; make it with 'sagemp {missing[0]}{said}'"
+            f"{states[missing[0]].path}: missing; make it with 'sagemp {missing[0]}{where}'"
             f" (or 'sagemp run{said}', which makes everything that is missing)"
         )
 
 
-def explain(states: dict[str, FileState], name: str) -> None:
+def explain(context: StageContext, states: dict[str, FileState], name: str) -> None:
     """Say what a stage would read and write."""
     state = states[name]
     typer.echo(f"sagemp {name} would")
-    for source in state.stage.inputs:
+    for source in state.stage.inputs_in(context.config):
         typer.echo(f"  read     {states[source].path} ({states[source].freshness})")
     typer.echo(f"  {'replace' if state.path.exists() else 'write'}    {state.path}")
 

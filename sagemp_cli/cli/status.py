@@ -34,7 +34,7 @@ def status(
             {
                 "stage": name,
                 "file": str(state.path),
-                "inputs": list(state.stage.inputs),
+                "inputs": list(state.stage.inputs_in(context.config)),
                 "state": str(state.freshness),
                 "why": state.why,
                 "created_utc": state.header.created_utc if state.header else None,
@@ -62,7 +62,7 @@ def status(
         made = f"made {state.header.created_utc[:16].replace('T', ' ')} UTC" if state.header else ""
         table.add_row(
             name,
-            ", ".join(states[i].stage.role for i in state.stage.inputs) or "-",
+            ", ".join(states[i].stage.role for i in state.stage.inputs_in(context.config) if i in states) or "-",
             state.path.name,
             Text(str(state.freshness), style=_STYLES[state.freshness]),
             Text(state.why or made),

@@ -47,12 +47,12 @@ def verify(
     known = state.freshness is Freshness.FRESH and not overwrite
     if not known:
         refuse_existing_output(state, overwrite)
-        require_inputs(states, "verify", given)
+        require_inputs(context, states, "verify", given)
     if dry_run:
         if known:
             typer.echo(f"sagemp verify would print the verdict of {state.path}, which is up to date")
         else:
-            explain(states, "verify")
+            explain(context, states, "verify")
         return
     with limited(time_limit):
         path = state.path if known else state.stage.run(context)

@@ -46,6 +46,7 @@ class NeuralODE(nn.Module):
         noise_time: see above.
     """
 
+    learns_from: ClassVar = "demonstrations"
     loss_type: ClassVar = NeuralODELoss
 
     def __init__(

@@ -12,7 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.stages.stage import STAGES, Stage, StageContext, first_difference, section
+from sagemp_cli.stages.stage import STAGES, Stage, StageContext, first_difference, section, stages_of
 from sagemp_cli.storage import Header, open_header, sha256_of
 from sagemp_cli.storage.kinds import KINDS
 
@@ -48,11 +48,17 @@ class FileState:
     sha256: str = ""
 
 
-def survey(context: StageContext) -> dict[str, FileState]:
-    """The state of every stage's file, in the order of :data:`~sagemp_cli.stages.stage.STAGES`, by stage name."""
+def survey(context: StageContext, *, last: str | None = None) -> dict[str, FileState]:
+    """The state of the file of every stage that the experiment has, in the order of the pipeline, by stage name.
+
+    A file that comes from another experiment has the state that it has there.
+    """
     states: dict[str, FileState] = {}
-    for stage in STAGES:
-        states[stage.name] = _state_of(stage, context, states)
+    for stage in stages_of(context.config, *([(last,)] if last else [])):
+        owner = context.owner(stage.name)
+        states[stage.name] = (
+            _state_of(stage, context, states) if owner is context else survey(owner, last=stage.name)[stage.name]
+        )
     return states
 
 
@@ -68,7 +74,7 @@ def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileStat
     except ArtifactError as e:
         return FileState(stage, path, Freshness.DAMAGED, str(e).removeprefix(f"{path}: "))
     why = (
-        _config_change(stage, header, context) or _input_change(stage, header, before) or _file_change(header, context)
+        _config_change(stage, header, context) or _input_change(stage, header, context, before) or _file_change(header, context)
     )
     return FileState(stage, path, Freshness.STALE if why else Freshness.FRESH, why, header, sha256_of(path))
 
@@ -82,9 +88,9 @@ def _config_change(stage: Stage, header: Header, context: StageContext) -> str:
     return ""
 
 
-def _input_change(stage: Stage, header: Header, before: Mapping[str, FileState]) -> str:
+def _input_change(stage: Stage, header: Header, context: StageContext, before: Mapping[str, FileState]) -> str:
     recorded = {parent.role: parent.sha256 for parent in header.parents}
-    for name in stage.inputs:
+    for name in stage.inputs_in(context.config):
         source = before[name]
         if source.freshness is not Freshness.FRESH:
             return f"its input {source.path.name} is {source.freshness}"

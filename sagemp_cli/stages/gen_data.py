@@ -10,7 +10,6 @@ import numpy as np
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts import (
-    SIDE_NAMES,
     Demonstration,
     Expert,
     Weights,
@@ -19,6 +18,7 @@ from sagemp_cli.experts import (
 )
 from sagemp_cli.report.demonstrations import draw_demonstrations
 from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.scenes.sides import side_label
 from sagemp_cli.stages.options import options_for, whole_number
 from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.problem import problem_of
@@ -80,12 +80,11 @@ def _record(found: Sequence[dict[str, np.ndarray]], dimension: int) -> Demonstra
     failed = [f"problem {index}: {item['failure']}" for index, item in enumerate(found) if "failure" in item]
     if not solved:
         raise ConfigError(f"expert: none of {len(found)} problems was solved; {failed[0]}")
-    letters = [name[0].upper() for name in SIDE_NAMES[dimension]]
     return Demonstrations(
         states=np.stack([item["states"] for _, item in solved]),
         controls=np.stack([item["controls"] for _, item in solved]),
         problem=np.array([index for index, _ in solved], dtype=np.int64),
-        side=tuple("".join(letters[s] for s in item["sides"]) for _, item in solved),
+        side=tuple(side_label(item["sides"], dimension) for _, item in solved),
         iterations=np.array([item["iterations"] for _, item in solved], dtype=np.int64),
         seconds=np.array([item["seconds"] for _, item in solved]),
         failed=tuple(failed),

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sagemp_cli.binding import all_complaints, build, option_complaints, target_class
+from sagemp_cli.config import options_of
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
 from sagemp_cli.experts import Expert, Weights
 from sagemp_cli.planners import train_planner
@@ -13,6 +14,7 @@ from sagemp_cli.reachability.partition import uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.proof import partition_complaints
+from sagemp_cli.stages.stage import STAGES
 from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
@@ -71,6 +73,7 @@ def _option_complaints(config: Mapping[str, Any]) -> Iterator[str]:
     if training.get("tube") is not None:
         yield from option_complaints(TubeLoss, training["tube"], "training.tube")
 
+    yield from _source_complaints(config["sources"], str(config["name"]))
     given = ("verification", "dynamics", "tracker", "scene", *_RUN)
     yield from option_complaints(attack, config["verify"].get("falsifier"), "verify.falsifier", given=given)
     for section, known in _KEYS.items():
@@ -78,6 +81,25 @@ def _option_complaints(config: Mapping[str, Any]) -> Iterator[str]:
             if key not in known:
                 near = did_you_mean(str(key), known) or f"; known: {', '.join(known)}"
                 yield f"{section}.{key}: no such option{near}"
+
+
+def _source_complaints(sources: Any, own: str) -> Iterator[str]:
+    shared = [stage.name for stage in STAGES if any(stage.name in other.inputs for other in STAGES)]
+    experiments = options_of("experiment")
+    if not isinstance(sources, Mapping):
+        yield f"sources must be a mapping of stages to experiments, found {sources!r}"
+        return
+    for stage, experiment in sources.items():
+        if stage not in shared:
+            near = did_you_mean(str(stage), shared) or f"; allowed: {', '.join(shared)}"
+            yield f"sources.{stage}: no stage whose file another one could use{near}"
+        if experiment is None:
+            continue
+        if experiment not in experiments:
+            near = did_you_mean(str(experiment), experiments) or f"; known: {', '.join(experiments)}"
+            yield f"sources.{stage}: no experiment '{experiment}'{near}"
+        elif experiment == own:
+            yield f"sources.{stage}: {own} is this experiment itself"
 
 
 def _problem_complaints(config: Mapping[str, Any]) -> list[str]:

@@ -6,17 +6,20 @@ elsewhere. The table :data:`STAGES` is all that ``run``, ``status`` and the comm
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from sagemp_cli.errors import ArtifactError
+from sagemp_cli.binding import target_class
+from sagemp_cli.config import compose
+from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.storage import (
     Artifact,
@@ -43,8 +46,9 @@ class Stage:
         name: the command.
         output: file name of what it writes, in the experiment's folder.
         record: record class of that file.
-        inputs: names of the stages whose outputs it reads.
+        inputs: names of the stages whose outputs it reads, where those apply.
         sections: dotted config keys that its output depends on, beyond those of its inputs.
+        applies: whether an experiment has this stage at all, from its config.
     """
 
     name: str
@@ -52,6 +56,11 @@ class Stage:
     record: type
     inputs: tuple[str, ...]
     sections: tuple[str, ...]
+    applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
+
+    def inputs_in(self, config: Mapping[str, Any]) -> tuple[str, ...]:
+        """Names of the stages whose outputs it reads in an experiment."""
+        return tuple(name for name in self.inputs if stage_named(name).applies(config))
 
     @property
     def role(self) -> str:
@@ -60,8 +69,20 @@ class Stage:
 
     def run(self, context: StageContext) -> Path:
         """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote."""
+        owner = context.owner(self.name)
+        if owner is not context:
+            raise ConfigError(
+                f"sources.{self.name}: {context.config['name']} takes {self.output} from {owner.config['name']}; "
+                f"make it with 'sagemp {self.name} experiment={owner.config['name']}'"
+            )
         refuse_existing(context.output_path(self.name), context.overwrite)
         return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}").run(context)
+
+
+
+def _has_demonstrations(config: Mapping[str, Any]) -> bool:
+    """Whether the planner learns from an expert; one of a file or one that teaches itself does not."""
+    return getattr(target_class(config["planner"], "planner"), "learns_from", None) == "demonstrations"
 
 
 _ROBOT = ("name", "dynamics", "scene", "horizon")
@@ -69,7 +90,14 @@ _ROBOT = ("name", "dynamics", "scene", "horizon")
 _PARTITION = ("verify.partitions", "verify.budget", "verify.memory")
 
 STAGES = (
-    Stage("gen-data", "demonstrations.h5", Demonstrations, (), (*_ROBOT, "expert", "start", "seed")),
+    Stage(
+        "gen-data",
+        "demonstrations.h5",
+        Demonstrations,
+        (),
+        (*_ROBOT, "expert", "start", "seed"),
+        applies=_has_demonstrations,
+    ),
     Stage("train-planner", "planner.h5", PlannerModel, ("gen-data",), (*_ROBOT, "planner", "planner_training", "seed")),
     Stage(
         "train-tracker",
@@ -105,6 +133,22 @@ STAGES = (
 def stage_named(name: str) -> Stage:
     """The stage of a command."""
     return next(s for s in STAGES if s.name == name)
+
+
+def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "build-library", "execute")) -> list[Stage]:
+    """The stages that an experiment's ``last`` ones need, in order, themselves included.
+
+    Of a stage whose file another experiment makes, the inputs are that experiment's affair.
+    """
+    needed: set[str] = set()
+    waiting = list(last)
+    while waiting:
+        name = waiting.pop()
+        if name not in needed:
+            needed.add(name)
+            if config["sources"].get(name) is None:
+                waiting += stage_named(name).inputs_in(config)
+    return [stage for stage in STAGES if stage.name in needed]
 
 
 def section(config: Mapping[str, Any], dotted: str) -> Any:
@@ -148,9 +192,29 @@ class StageContext:
         digest = hashlib.sha256(f"{self.seed}/{purpose}".encode()).digest()
         return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
 
+    def owner(self, stage: str) -> StageContext:
+        """The context in which a stage's file is made: this one, or that of the experiment named in ``sources``.
+
+        The other experiment is run as it is in its own file: of this call's overrides it only gets seed, effort,
+        artifacts and device.
+
+        Raises:
+            ConfigError: sources that lead back to where they started.
+        """
+        here, passed = self, [self.config["name"]]
+        while (name := here.config["sources"].get(stage)) is not None:
+            if name in passed:
+                raise ConfigError(f"sources.{stage}: {' -> '.join([*passed, name])} goes in a circle")
+            passed.append(name)
+            shared = {key: here.config[key] for key in ("seed", "artifacts", "device")}
+            options = (f"effort={here.config['effort']['name']}", *(f"{k}={v}" for k, v in shared.items()))
+            other = StageContext.of(_composed((f"experiment={name}", *options)))
+            here = replace(here, config=other.config, folder=other.folder)
+        return here
+
     def output_path(self, stage: str) -> Path:
-        """Where a stage's output is."""
-        return self.folder / stage_named(stage).output
+        """Where a stage's output is, in this experiment's folder or in that of the one it comes from."""
+        return self.owner(stage).folder / stage_named(stage).output
 
     def partial_folder(self, stage: str) -> Path:
         """Where a long stage keeps finished pieces until its output is written."""
@@ -163,6 +227,15 @@ class StageContext:
             ArtifactError: missing (names the command that makes it), of another experiment, robot or dt,
                 or made from a parent that has changed since.
         """
+        owner = self.owner(stage)
+        if owner is not self:
+            artifact = owner.read(stage)
+            if owner.config["horizon"] != self.config["horizon"]:
+                raise ConfigError(
+                    f"sources.{stage}: {owner.config['name']} has horizon {owner.config['horizon']}, "
+                    f"{self.config['name']} has {self.config['horizon']}"
+                )
+            return artifact
         made_by, path = stage_named(stage), self.output_path(stage)
         if not path.exists():
             raise ArtifactError(
@@ -207,6 +280,11 @@ class StageContext:
             device=str(self.config["device"]),
         )
         return write_artifact(self.output_path(stage), record, header, overwrite=self.overwrite)
+
+
+@functools.cache
+def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
+    return compose(overrides)
 
 
 def first_difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:

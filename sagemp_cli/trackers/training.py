@@ -36,21 +36,25 @@ class RolloutSampler:
         references: ``(R, K+1, n)``.
         start: ``X_I`` of one reference (its deviation from ``x_I`` is used for all).
         disturbance: ``W``.
-        length: steps per rollout H.
         spread: extra deviation in every state, as a share of the limits' range, for the later starts.
     """
 
     references: Tensor
     start: Box
     disturbance: Box
-    length: int
     spread: Tensor
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """References ``(count, K+1, n)`` from the drawn step, starts ``(count, n)``, disturbances ``(count, H, n)``."""
+    def draw(self, count: int, length: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """References ``(count, K+1, n)`` from the drawn step, starts ``(count, n)``, disturbances ``(count, H, n)``.
+
+        Args:
+            count: rollouts.
+            length: steps per rollout H.
+            generator: source of all randomness.
+        """
         total, horizon = self.references.shape[0], self.references.shape[1] - 1
         chosen = torch.randint(total, (count,), generator=generator)
-        shift = torch.randint(max(1, horizon - self.length // 2), (count,), generator=generator)
+        shift = torch.randint(max(1, horizon - length // 2), (count,), generator=generator)
         early = torch.arange(count) < (count + 1) // 2
         shift = torch.where(early, torch.zeros_like(shift), shift)
         index = (shift[:, None] + torch.arange(horizon + 1)).clamp(max=horizon)
@@ -60,7 +64,7 @@ class RolloutSampler:
         share = torch.rand(count, 1, dtype=torch.float64, generator=generator)
         late = 0.2 * share * offset + share * unit * self.spread
         starts = references[:, 0] + torch.where(early[:, None], offset, late)
-        w = self.disturbance.sample(count * self.length, generator).unflatten(0, (count, self.length))
+        w = self.disturbance.sample(count * length, generator).unflatten(0, (count, length))
         # Every second rollout is disturbed by constant extremes: independent noise averages out and teaches little.
         sign = torch.randn(count, 1, w.shape[-1], dtype=torch.float64, generator=generator)
         held = torch.where(sign > 0, self.disturbance.upper, self.disturbance.lower)
@@ -79,6 +83,7 @@ def train_tracker(
     steps: int,
     batch: int = 64,
     rollout_steps: int = 40,
+    first_rollout_steps: int | None = None,
     learning_rate: float = 5e-3,
     weights: Mapping[str, float] | None = None,
     tube: TubeLoss | None = None,
@@ -99,6 +104,8 @@ def train_tracker(
         steps: gradient steps.
         batch: rollouts per step.
         rollout_steps: steps H per rollout (at most K).
+        first_rollout_steps: steps per rollout at the beginning; they grow to ``rollout_steps`` by halfway. Rollouts of
+            an untrained tracker on a robot that tumbles leave every bound, and their gradients say nothing.
         learning_rate: peak learning rate.
         weights: ``track``, ``state``, ``control`` of :class:`LossWeights`.
         tube: reachability-aware part, None for the paper's plain loss.
@@ -108,19 +115,26 @@ def train_tracker(
     horizon = references.shape[1] - 1
     if not 1 <= rollout_steps <= horizon:
         raise ConfigError(f"training.rollout_steps must lie in 1..{horizon}, found {rollout_steps}")
+    first = rollout_steps if first_rollout_steps is None else first_rollout_steps
+    if not 1 <= first <= rollout_steps:
+        raise ConfigError(f"training.first_rollout_steps must lie in 1..{rollout_steps}, found {first}")
     loss_weights = LossWeights(**(weights or {}))
     spread = 0.05 * (dynamics.state_upper - dynamics.state_lower)
-    sampler = RolloutSampler(references, start, disturbance, rollout_steps, spread)
+    sampler = RolloutSampler(references, start, disturbance, spread)
+
+    def tracking(module: nn.Module, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        assert isinstance(module, Tracker)
+        drawn, x, w = sampler.draw(batch, length, generator)
+        states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
+        return rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : length + 1], loss_weights)
 
     def plain(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        assert isinstance(module, Tracker)
-        drawn, x, w = sampler.draw(batch, generator)
-        states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
-        return rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : rollout_steps + 1], loss_weights)
+        share = min(1.0, 2 * step / steps)
+        return tracking(module, round(first * (rollout_steps / first) ** share), generator)
 
     def with_tube(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Tracker) and tube is not None
-        value, figures = plain(module, step, generator)
+        value, figures = tracking(module, rollout_steps, generator)
         share = step / max(1, tube_steps - 1)
         width, more = tube(
             module,

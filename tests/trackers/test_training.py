@@ -16,8 +16,8 @@ from sagemp_cli.trackers.tube_loss import TubeLoss
 
 def draw(references, start, disturbance, *, count=64, length=8, seed=0):
     spread = torch.tensor([0.3, 0.2, 0.1, 0.1], dtype=torch.float64)
-    sampler = RolloutSampler(references, start, disturbance, length, spread)
-    return sampler.draw(count, torch.Generator().manual_seed(seed))
+    sampler = RolloutSampler(references, start, disturbance, spread)
+    return sampler.draw(count, length, torch.Generator().manual_seed(seed))
 
 
 def test_half_of_the_rollouts_start_in_the_start_set_at_step_0(references, start, disturbance):
