@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sagemp_cli.experts.homotopy import sides_of
 from sagemp_cli.experts.initial_guess import fill_path
 from sagemp_cli.experts.interior_point import optimality_error, solve_chain
 from sagemp_cli.experts.transcription import Transcription
+from sagemp_cli.scenes.sides import sides_of
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Trajectory:
     Attributes:
         states: ``(K+1, n)``, the rollout of ``controls`` from the start without disturbance.
         controls: ``(K, m)``.
-        sides: side per obstacle, as measured on the rollout; indices into ``homotopy.SIDE_NAMES``.
+        sides: side per obstacle, as measured on the rollout; indices into ``scenes.sides.SIDE_NAMES``.
         cost: J (see :class:`~sagemp_cli.experts.transcription.Weights`).
         control_violation: most by which a control exceeds its limits (0 inside).
         state_violation: most by which a state of steps 1..K exceeds limits or the shrunken workspace.

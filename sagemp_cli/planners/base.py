@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.training import Loss
+from sagemp_cli.training import History, Loss
 
 
 @runtime_checkable
@@ -34,29 +36,81 @@ class Planner(Protocol):
         """
 
 
-class LearnedPlanner(Planner, Protocol):
-    """A planner that is an ``nn.Module`` and learns from demonstrations.
+@runtime_checkable
+class Proposer(Planner, Protocol):
+    """A planner that generates the start too, and then moves its plans onto it.
+
+    ``sample(start, ...)`` is ``settle(propose(start, ...), start)``: apart, they show how far off the start was.
+    """
+
+    def propose(self, start: Tensor, goal: Box, *, scene: Scene, count: int, generator: torch.Generator) -> Tensor:
+        """Plans ``(count, K+1, n)`` that begin near the start."""
+
+    def settle(self, plans: Tensor, start: Tensor) -> Tensor:
+        """The plans moved onto their starts ``(n,)`` or ``(count, n)``, without a jump."""
+
+
+class StoredPlanner(Planner, Protocol):
+    """A planner that is an ``nn.Module`` and can be kept in a file.
 
     ``type(planner)(**planner.arguments)`` and ``load_state_dict(planner.state_dict())`` rebuild it.
+
+    Attributes:
+        learns_from: what it is trained with. ``"demonstrations"``: see :class:`LearnedPlanner`; ``"scenes"``: see
+            :class:`SelfTaughtPlanner`; ``"nothing"``: it is complete as it is built.
+        arguments: constructor arguments as plain data.
+    """
+
+    learns_from: ClassVar[str]
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Constructor arguments as plain data."""
+
+
+class LearnedPlanner(StoredPlanner, Protocol):
+    """A planner that learns from demonstrations: its ``learns_from`` is ``"demonstrations"``.
 
     Attributes:
         loss_type: called as ``loss_type(planner, demonstrations, steps=..., **options)`` after :meth:`prepare`;
             gives the loss of the training loop. Its signature says which options there are.
         state_dim: number of states n.
         horizon: number of steps K.
-        arguments: constructor arguments as plain data.
     """
 
     loss_type: ClassVar[Callable[..., Loss]]
     state_dim: int
     horizon: int
 
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Constructor arguments as plain data."""
-
-    def prepare(self, demonstrations: Tensor, *, generator: torch.Generator) -> None:
+    def prepare(self, demonstrations: Tensor, *, goal: Box, generator: torch.Generator) -> None:
         """Take from demonstrations ``(D, K+1, n)`` what is not learned by descent, and draw initial weights."""
+
+
+class SelfTaughtPlanner(StoredPlanner, Protocol):
+    """A planner that makes its own lessons: its ``learns_from`` is ``"scenes"``."""
+
+    def learn(
+        self,
+        *,
+        scene: Scene,
+        generator: torch.Generator,
+        checkpoint: Path | None,
+        identity: str,
+        progress: Progress | None,
+        **options: Any,
+    ) -> History:
+        """Train in place; ``options`` are the config's ``planner_training``, bound to the class's own signature.
+
+        ``checkpoint``, ``identity`` and ``progress`` are as in :func:`sagemp_cli.training.fit`.
+        """
+
+
+def affordable(planner: Planner, wanted: int) -> int:
+    """How many plans may be asked for just to look at them: ``wanted``, or fewer where the planner says so.
+
+    A planner whose plans cost a request each has an attribute ``affordable_plans``.
+    """
+    return max(1, min(wanted, getattr(planner, "affordable_plans", wanted)))
 
 
 def starts_of(start: Tensor, *, count: int, state_dim: int) -> Tensor:

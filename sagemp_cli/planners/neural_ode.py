@@ -46,7 +46,7 @@ class NeuralODE(nn.Module):
         noise_time: see above.
     """
 
-    learns_from: ClassVar = "demonstrations"
+    learns_from: ClassVar[str] = "demonstrations"
     loss_type: ClassVar = NeuralODELoss
 
     def __init__(
@@ -94,8 +94,8 @@ class NeuralODE(nn.Module):
             "noise_time": self.noise_time,
         }
 
-    def prepare(self, demonstrations: Tensor, *, generator: torch.Generator) -> None:
-        """Fit the normaliser to demonstrations ``(D, K+1, n)`` and draw initial weights."""
+    def prepare(self, demonstrations: Tensor, *, goal: Box, generator: torch.Generator) -> None:
+        """Fit the normaliser to demonstrations ``(D, K+1, n)`` and draw initial weights; the goal is theirs."""
         self.normalizer.fit(demonstrations)
         self.field.reset(generator)
 

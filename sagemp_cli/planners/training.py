@@ -1,7 +1,8 @@
-"""Training of any learned planner on demonstrations, and the figures that say how good its plans are."""
+"""Training of any planner that learns from demonstrations."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,17 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, UsageError
-from sagemp_cli.planners.base import LearnedPlanner, Planner
+from sagemp_cli.planners.base import LearnedPlanner
+from sagemp_cli.planners.figures import plan_figures
 from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.training import History, fit
+
+PLANS = 200
+"""Plans of a validation at least: as many from each held-out start as that takes."""
+
+LOSS_BATCHES = 4
+"""Batches that the loss on the held-out demonstrations is averaged over."""
 
 
 def train_planner(
@@ -32,9 +40,11 @@ def train_planner(
     identity: str = "",
     progress: Progress | None = None,
 ) -> History:
-    """Train ``planner`` in place; the validation curve is :func:`plan_figures` on the held-out demonstrations.
+    """Train ``planner`` in place; validate it on the held-out demonstrations.
 
-    The result depends on the arguments and the generator's state alone, not on the planner's weights before.
+    The validation curve is :func:`~sagemp_cli.planners.figures.plan_figures` and ``held-out loss``, the planner's own
+    loss as in the last update. The result depends on the arguments and the generator's state alone, not on the
+    planner's weights before.
 
     Args:
         planner: what learns.
@@ -61,17 +71,22 @@ def train_planner(
             raise UsageError(f"{name} must have shape (count, {wanted[0]}, {wanted[1]}), found {tuple(data.shape)}")
         if not bool(torch.isfinite(data).all()):
             raise NonFiniteError(f"{name} contain NaN or infinity")
-    planner.prepare(demonstrations, generator=generator)
+    planner.prepare(demonstrations, goal=scene.goal, generator=generator)
+    options = {"steps": steps, **(loss or {})}
+    held_out_loss = planner.loss_type(planner, held_out, **options)
+    shown = held_out.repeat_interleave(math.ceil(PLANS / len(held_out)), dim=0)
     # Every validation draws the same numbers, so that its curve shows the planner's course and not chance.
     seed = int(torch.randint(2**31, (), generator=generator))
 
-    def validate(subject: Planner) -> Mapping[str, float]:
+    def validate(subject: LearnedPlanner) -> Mapping[str, float]:
         drawn = torch.Generator().manual_seed(seed)
-        return plan_figures(subject, held_out, scene=scene, position=position, generator=drawn)
+        figures = plan_figures(subject, shown, scene=scene, position=position, generator=drawn)
+        losses = [float(held_out_loss(subject, steps - 1, drawn)[0]) for _ in range(LOSS_BATCHES)]
+        return {"held-out loss": sum(losses) / len(losses)} | figures
 
     return fit(
         planner,
-        planner.loss_type(planner, demonstrations, steps=steps, **(loss or {})),
+        planner.loss_type(planner, demonstrations, **options),
         steps=steps,
         learning_rate=learning_rate,
         ema_decay=ema_decay,
@@ -82,36 +97,3 @@ def train_planner(
         progress=progress,
         description="training the planner",
     )
-
-
-def plan_figures(
-    planner: Planner,
-    demonstrations: Tensor,
-    *,
-    scene: Scene,
-    position: tuple[int, ...],
-    generator: torch.Generator,
-) -> dict[str, float]:
-    """How good one plan from every demonstrated start is, as a plan: nothing tracks it.
-
-    Returns:
-        ``position error``: root mean square distance to the demonstration over steps and demonstrations, metres (a
-        plan that takes another side than the demonstration counts as far away); ``median position error``: median
-        over demonstrations of that over steps; ``collision-free``: share of plans that keep clear at every step;
-        ``in goal``: share that end in the goal box; ``goal error``: mean distance of the last position to the
-        goal's centre over dimensions in which the goal is bounded, metres.
-    """
-    plans = planner.sample(
-        demonstrations[:, 0], scene.goal, scene=scene, count=len(demonstrations), generator=generator
-    )
-    where = list(position)
-    square = (plans - demonstrations)[..., where].square().sum(-1).mean(-1)
-    center = scene.goal.center[where]
-    beside = (plans[:, -1, where] - center)[:, torch.isfinite(center)]
-    return {
-        "position error": float(square.mean().sqrt()),
-        "median position error": float(square.sqrt().median()),
-        "collision-free": float((scene.signed_distance(plans[..., where]) > 0).all(-1).double().mean()),
-        "in goal": float(scene.goal.contains(plans[:, -1]).double().mean()),
-        "goal error": float(torch.linalg.vector_norm(beside, dim=-1).mean()),
-    }

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sagemp_cli.models import planner_from
+from sagemp_cli.planners.base import affordable
 from sagemp_cli.report.canvas import (
     DANGER,
     MODES,
@@ -20,48 +24,61 @@ from sagemp_cli.report.canvas import (
     legend_above,
 )
 from sagemp_cli.report.training import draw_losses, draw_validation
+from sagemp_cli.scenes.sides import side_label, sides_of
 from sagemp_cli.storage import Artifact, PlannerModel
 
 SAMPLES = 80
-"""References drawn for the picture."""
+"""References drawn for the picture, if the planner can afford them."""
+
+CURVES = ("collision-free", "in goal", "start error", "goal error", "share ")
+"""How the names of those validation figures begin that are shown: shares, and metres that are small."""
 
 
 def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
-    """Samples to scale, those in collision in red; the training curve beside them."""
+    """Samples to scale by the sides on which they pass the obstacles, those in collision in red.
+
+    Beside them the losses and the validation curve, where the planner was trained.
+    """
     setting, planner = Setting.of(artifact.header.config), planner_from(artifact)
     generator = torch.Generator().manual_seed(artifact.header.seed)
+    count = affordable(planner, SAMPLES)
     references = planner.sample(
-        setting.start.sample(SAMPLES, generator),
+        setting.start.sample(count, generator),
         setting.scene.goal,
         scene=setting.scene,
-        count=SAMPLES,
+        count=count,
         generator=generator,
     )
-    clear = (setting.scene.signed_distance(references[..., list(setting.dynamics.position)]) > 0).all(-1).numpy()
+    position = list(setting.dynamics.position)
+    clear = (setting.scene.signed_distance(references[..., position]) > 0).all(-1).numpy()
     reaches = setting.scene.goal.contains(references[:, -1]).numpy()
     paths = references[..., setting.plane].numpy()
+    places = references[..., position].numpy()
+    sides = np.array([side_label(sides_of(path, setting.scene.obstacles), len(position)) for path in places])
 
-    figure = blank_figure(13, 5.2)
-    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
+    trained = len(artifact.record.curve.step) > 0
+    figure = blank_figure(13 if trained else 9, 5.2)
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1)) if trained else figure.add_gridspec(2, 1)
     scene = figure.add_subplot(grid[:, 0])
     draw_scene(scene, setting)
     draw_start(scene, setting)
-    draw_paths(scene, paths[clear], colors=MODES[0], linewidths=0.9, alpha=0.45)
+    handles = []
+    for i, (side, _) in enumerate(Counter(sides[clear]).most_common()):
+        shown, colour = paths[clear & (sides == side)], MODES[i % len(MODES)]
+        draw_paths(scene, shown, colors=colour, linewidths=0.9, alpha=0.45)
+        handles.append(Line2D([], [], color=colour, lw=2, label=f"{side or 'collision-free'}: {len(shown)}"))
     draw_paths(scene, paths[~clear], colors=DANGER, linewidths=0.9, alpha=0.7)
+    handles.append(Line2D([], [], color=DANGER, lw=2, label=f"in collision: {int((~clear).sum())}"))
     scene.scatter(*paths[:, 0].T, s=6, color=MUTED, linewidths=0, zorder=4)
-    handles = [
-        Line2D([], [], color=MODES[0], lw=2, label=f"collision-free: {int(clear.sum())}"),
-        Line2D([], [], color=DANGER, lw=2, label=f"in collision: {int((~clear).sum())}"),
-    ]
     legend_above(scene, handles)
-    losses, validation = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    draw_losses(losses, artifact)
-    draw_validation(validation, artifact)
-    target = artifact.header.config["planner"]["_target_"].rpartition(".")[2]
+    if trained:
+        draw_losses(figure.add_subplot(grid[0, 1]), artifact)
+        draw_validation(figure.add_subplot(grid[1, 1]), artifact, only=CURVES)
+    label = getattr(planner, "label", f"{type(planner).__name__} planner")
     headline(
         figure,
-        f"{target} planner: {100 * clear.mean():.0f} % of its plans are collision-free",
-        f"{artifact.header.experiment}, {SAMPLES} samples from starts drawn in X$_I$, K = {references.shape[1] - 1}; "
+        f"{label}: {100 * clear.mean():.0f} % of its plans are collision-free",
+        f"{artifact.header.experiment}, {count} samples from starts drawn in X$_I$, K = {references.shape[1] - 1}; "
         f"{100 * reaches.mean():.0f} % end in the goal box; open loop, nothing tracks them",
     )
     return figure

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -57,19 +55,23 @@ def draw_losses(axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerM
         legend(axes, loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=len(shown), borderaxespad=0.1, fontsize=8)
 
 
-def draw_validation(axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> None:
-    """The validation's figures, shares and distances alike, on one axis from 0."""
+def draw_validation(
+    axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel], *, only: tuple[str, ...] = ("",)
+) -> None:
+    """The validation's figures whose names begin with one of ``only``, shares and distances alike, on one axis."""
     curve = artifact.record.curve
     style_axes(axes, xlabel="update", ylabel="validation")
-    names: Sequence[str] = [name for name in curve.names if name.startswith(_VALIDATION)]
-    for colour, name in zip(MODES, names, strict=False):
+    found = [
+        name for name in curve.names if name.startswith(_VALIDATION) and name.removeprefix(_VALIDATION).startswith(only)
+    ]
+    for colour, name in zip(MODES, found, strict=False):
         column = curve.values[:, curve.names.index(name)]
         measured = np.isfinite(column)
         style = {"color": colour, "linewidth": 1.4, "marker": "o", "markersize": 3}
         axes.plot(curve.step[measured], column[measured], label=name.removeprefix(_VALIDATION), **style)
     axes.set_ylim(0, 1.05)
-    if names:
-        legend(axes, loc="center right", fontsize=7.5)
+    if found:
+        legend(axes, loc="best", ncols=2, fontsize=7.5)
 
 
 def _positive(column: np.ndarray) -> bool:

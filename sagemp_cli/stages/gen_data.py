@@ -36,7 +36,7 @@ def run(context: StageContext) -> Path:
     weights = Weights(**options_for(Weights, section.pop("weights", None), "expert.weights"))
     given = ("dynamics", "scene", "horizon", "weights")
     expert = Expert(
-        problem.dynamics,
+        problem.dynamics.analytical,
         problem.scene,
         problem.horizon,
         weights,
@@ -44,7 +44,7 @@ def run(context: StageContext) -> Path:
     )
     problems = plan_demonstrations(problem.start, count, seed=context.seed)
     # A demonstration does not depend on how many there are or who solves it, so these may change between runs.
-    partial = PartialResults.of(context, "gen-data", without=("expert.count", "expert.processes"))
+    partial = PartialResults.of(context, "gen-data", without=("expert.count",))
     done = partial.finished & set(range(count))
     with (
         context.progress.task("demonstrations", count, len(done)) as task,

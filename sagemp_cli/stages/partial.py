@@ -34,7 +34,7 @@ def work_identity(
     config = {key: copy.deepcopy(section(context.config, key)) for key in stage_named(stage).sections}
     for dotted in without:
         key, name = dotted.rsplit(".", 1)
-        (section(config, key) or {}).pop(name, None)
+        (config.get(key) or {}).pop(name, None)
     data = [__version__, stage, config, sorted((p.role, p.sha256) for p in parents)]
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 

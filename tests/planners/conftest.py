@@ -15,10 +15,11 @@ def scene():
     return Scene(Box(torch.tensor([-2.0, -4.0]), torch.tensor([10.0, 4.0])), (Ball((4.0, 0.0), 1.0),), goal)
 
 
-def curves(count, seed):
+def curves(count, seed, *, sides=None):
     """States ``(count, K+1, 4)`` on curves that pass above the disc if they start above, else below.
 
-    No curve starts near the x axis, so a smooth field can tell the sides apart. The path is
+    No curve starts near the x axis, so a smooth field can tell the sides apart; ``sides (count, 1)`` of 1 and -1 sets
+    them free from the start. The path is
     ``y = y0 (1 - s)^2 + side 1.8 sin(pi s)^2``, ``x = x0 + (8 - x0) s``; heading and speed are its own.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -26,7 +27,7 @@ def curves(count, seed):
     y0 = 0.8 * torch.rand(count, 1, dtype=torch.float64, generator=generator) - 0.4
     y0 = y0 + 0.4 * torch.sign(y0)
     s = torch.linspace(0, 1, HORIZON + 1, dtype=torch.float64)
-    side = torch.where(y0 >= 0, 1.0, -1.0)
+    side = torch.where(y0 >= 0, 1.0, -1.0) if sides is None else sides
     x = x0 + (8 - x0) * s
     y = y0 * (1 - s) ** 2 + 1.8 * side * torch.sin(torch.pi * s) ** 2
     slope = -2 * y0 * (1 - s) + 1.8 * side * torch.pi * torch.sin(2 * torch.pi * s)
@@ -43,3 +44,10 @@ def demonstrations():
 @pytest.fixture(scope="session")
 def held_out():
     return curves(20, seed=1)
+
+
+@pytest.fixture(scope="session")
+def two_sided():
+    """Curves of which half pass above and half below, wherever they start."""
+    sides = torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(60)[:, None]
+    return curves(120, seed=2, sides=sides)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sagemp_cli.errors import ConfigError, NonFiniteError, UsageError
-from sagemp_cli.planners import NeuralODE, plan_figures, train_planner
+from sagemp_cli.planners import NeuralODE, train_planner
 from sagemp_cli.planners.neural_ode_loss import NeuralODELoss
 
 POSITION, HORIZON = (0, 1), 40
@@ -31,6 +31,14 @@ def test_plans_from_new_starts_keep_clear_and_reach_the_goal(trained):
     assert figures["collision-free"] >= 0.85
     assert figures["in goal"] >= 0.9
     assert figures["goal error"] < 0.25
+
+
+def test_the_validation_curve_has_the_loss_on_held_out_demonstrations(trained, demonstrations, held_out, scene):
+    course = trained[1].validation["held-out loss"]
+    assert course[-1] < 0.1 * course[0]
+    known = train(planner(), demonstrations, demonstrations, scene, steps=10).validation["held-out loss"]
+    unknown = train(planner(), demonstrations, held_out, scene, steps=10).validation["held-out loss"]
+    assert not (known == unknown).any()
 
 
 def test_the_side_follows_from_the_start(trained, scene):
@@ -86,7 +94,7 @@ def test_windows_grow_to_the_whole_horizon(demonstrations):
     assert set(lengths[34:]) == {HORIZON}
 
 
-def test_the_derivative_target_attracts(demonstrations):
+def test_the_derivative_target_attracts(demonstrations, scene):
     """On one demonstration the best field in closed form is (z_{k+1} - z_k)/h - pull (z - z_k): its loss is zero."""
 
     class Ideal(torch.nn.Module):
@@ -99,42 +107,12 @@ def test_the_derivative_target_attracts(demonstrations):
             return (self.states[k + 1] - self.states[k]) * HORIZON - 3.0 * (z - self.states[k])
 
     made = planner()
-    made.prepare(demonstrations[:1], generator=torch.Generator().manual_seed(0))
+    made.prepare(demonstrations[:1], goal=scene.goal, generator=torch.Generator().manual_seed(0))
     loss = NeuralODELoss(made, demonstrations[:1], steps=10, derivative_share=1.0, pull=3.0)
     made.field = Ideal(made.normalizer.normalize(demonstrations[0]).float())
     assert float(loss(made, 0, torch.Generator().manual_seed(0))[0]) < 1e-8
     weaker = NeuralODELoss(made, demonstrations[:1], steps=10, derivative_share=1.0, pull=1.0, spread=0.5)
     assert float(weaker(made, 0, torch.Generator().manual_seed(0))[0]) == pytest.approx((2 * 0.5) ** 2, rel=0.1)
-
-
-class Recorded:
-    """A planner that repeats given trajectories."""
-
-    def __init__(self, plans):
-        self.plans = plans
-
-    def sample(self, start, goal, *, scene, count, generator):
-        return self.plans
-
-
-def test_figures_of_known_plans(demonstrations, scene):
-    def figures(plans):
-        return plan_figures(
-            Recorded(plans), demonstrations, scene=scene, position=POSITION, generator=torch.Generator()
-        )
-
-    perfect = figures(demonstrations)
-    assert perfect["position error"] == 0 and perfect["collision-free"] == 1 and perfect["in goal"] == 1
-    assert perfect["goal error"] == pytest.approx(0, abs=1e-12)
-    moved = figures(demonstrations + torch.tensor([0.3, 0.4, 0.0, 0.0]))
-    assert moved["position error"] == pytest.approx(0.5) and moved["median position error"] == pytest.approx(0.5)
-    assert moved["goal error"] == pytest.approx(0.5)
-    through = demonstrations.clone()
-    through[:15, :, 1] = 0.0
-    assert figures(through)["collision-free"] == 0.75
-    missing = demonstrations.clone()
-    missing[:6, -1, 2] = 2.0
-    assert figures(missing)["in goal"] == 0.9
 
 
 def test_wrong_demonstrations_and_options_are_named(demonstrations, held_out, scene):
