@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint reproduce-figures benchmark campaign clean
+.PHONY: help venv demo test lint reproduce-figures safety-table benchmark campaign clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | \
@@ -49,6 +49,13 @@ reproduce-figures: venv  ## make every artifact and figure at full effort
 		case $$code in 0|5|10) ;; *) exit $$code;; esac; \
 	done
 	$(BIN)/python -m sagemp_cli.report.reproduce
+
+safety-table: venv  ## safety rates of diffusion and flow matching beside the paper's
+	@for experiment in planar_diffusion planar_cfm; do \
+		$(BIN)/sagemp run --until train-tracker experiment=$$experiment && \
+		$(BIN)/sagemp safety-rates experiment=$$experiment || exit $$?; \
+	done
+	$(BIN)/sagemp safety-rates --table
 
 benchmark: venv  ## run the benchmarks
 	$(BIN)/python benchmarks/reachability.py

@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.sets import Box
+
+
+class Loop(Protocol):
+    """Anything that turns starts and disturbances into rollouts: a closed loop, or controls that are played back."""
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps K."""
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+
+    def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """States ``(..., K+1, n)`` and controls ``(..., K, m)`` from starts ``(..., n)`` and ``w (..., K, d)``."""
 
 
 def random_disturbances(disturbance: Box, count: int, *, horizon: int, generator: torch.Generator) -> Tensor:
@@ -15,7 +31,7 @@ def random_disturbances(disturbance: Box, count: int, *, horizon: int, generator
 
 
 def worst_case_disturbances(
-    loop: ClosedLoop,
+    loop: Loop,
     starts: Tensor,
     *,
     disturbance: Box,
@@ -29,7 +45,7 @@ def worst_case_disturbances(
     case of that state; here it is a strong heuristic, no bound.
 
     Args:
-        loop: with references that broadcast against the starts.
+        loop: with references (or controls) that broadcast against the starts.
         starts: ``(B, n)``.
         disturbance: W.
         generator: chooses what to push.

@@ -7,16 +7,15 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from sagemp_cli.errors import ConfigError
 from sagemp_cli.library import REASONS, build_library
 from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.library import draw_library
-from sagemp_cli.sets import Box
 from sagemp_cli.stages.options import whole_number
-from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.proof import Proof
+from sagemp_cli.stages.reference_starts import reference_starts
 from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Library
@@ -24,19 +23,14 @@ from sagemp_cli.storage import Library
 
 def run(context: StageContext) -> Path:
     """Sample, reject or certify, attack what was certified, write the library."""
-    problem, section = problem_of(context.config), context.config["library"]
+    (problem, robot_files), section = trained_problem(context), context.config["library"]
     wanted = whole_number(section["size"], "library.size")
     budget = whole_number(section["budget"], "library.budget", least=wanted)
-    spread = section["start_spread"]
-    if not isinstance(spread, int | float) or not 0 <= spread <= 1:
-        raise ConfigError(f"library.start_spread must be a share of X_I in [0, 1], found {spread!r}")
-    proof = Proof.of(context.config, problem)
+    starts, proof = reference_starts(context.config, problem), Proof.of(context.config, problem)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
 
     generator = context.generator("build-library: references")
-    center = problem.start.center
-    starts = Box(center + spread * (problem.start.lower - center), center + spread * (problem.start.upper - center))
 
     def draw(count: int) -> Tensor:
         return planner.sample(
@@ -70,7 +64,8 @@ def run(context: StageContext) -> Path:
         reason_counts=np.array(made.counts, dtype=np.int64),
         sampled=made.sampled,
         wanted=wanted,
+        dynamics=robot_files[0].record.weights if robot_files else None,
     )
-    path = context.write("build-library", record, (planner_file, tracker_file))
+    path = context.write("build-library", record, (planner_file, tracker_file, *robot_files))
     draw_beside(path, draw_library, context.read("build-library"))
     return path

@@ -1,0 +1,44 @@
+"""Open-loop execution: the controls of a plan played back, whatever happens to the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """The robot under fixed controls; answers :meth:`rollout` as a closed loop does.
+
+    Attributes:
+        dynamics: the robot.
+        controls: ``(..., K, m)``; leading dimensions are batch and broadcast against those of the state.
+    """
+
+    dynamics: Dynamics
+    controls: Tensor
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps K."""
+        return self.controls.shape[-2]
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+        return self.dynamics.state_dim
+
+    def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """States ``(..., K+1, n)`` and the controls ``(..., K, m)``, from starts ``(..., n)`` under ``w (..., K, n)``.
+
+        Fewer rows of ``w`` give a shorter rollout.
+        """
+        steps, states = w.shape[-2], [x]
+        controls = self.controls[..., :steps, :].expand(*x.shape[:-1], steps, -1)
+        for k in range(steps):
+            states.append(self.dynamics.step(states[-1], controls[..., k, :], w[..., k, :]))
+        return torch.stack(states, dim=-2), controls

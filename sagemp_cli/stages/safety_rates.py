@@ -1,0 +1,94 @@
+"""``sagemp safety-rates``: the paper's surrogate for what certification brings.
+
+References are sampled from the planner as for a library; of each the stage asks whether it is safe from all of X_I when
+its controls are played back, when it is tracked, and whether that is certified.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.execution import DISTURBANCES, require_certified_safe, try_references
+from sagemp_cli.execution import Trials as Found
+from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.report.safety import draw_safety
+from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.partial import PartialResults
+from sagemp_cli.stages.problem import trained_problem
+from sagemp_cli.stages.proof import Proof
+from sagemp_cli.stages.reference_starts import reference_starts
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.storage import SafetyRates, Trials
+
+
+def run(context: StageContext) -> Path:
+    """Sample references, execute each in both ways, prove what can be proved of them, compare.
+
+    Finished chunks of the proof are kept until the output is written: an interrupted run goes on from there.
+
+    Raises:
+        UsageError: the robot has no inverse.
+        SoundnessError: a rollout breaks what was certified; nothing is written.
+    """
+    (problem, robot_files), section = trained_problem(context), context.config["safety"]
+    count = whole_number(section["references"], "safety.references")
+    rollouts = whole_number(section["rollouts"], "safety.rollouts")
+    within_limits = section["within_limits"]
+    if not isinstance(within_limits, bool):
+        raise ConfigError(f"safety.within_limits must be true or false, found {within_limits!r}")
+    starts, proof = reference_starts(context.config, problem), Proof.of(context.config, problem)
+    planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
+    tracker, generator = tracker_from(tracker_file), context.generator("safety-rates: references")
+    references = planner_from(planner_file).sample(
+        starts.sample(count, generator), problem.scene.goal, scene=problem.scene, count=count, generator=generator
+    )
+    if references.shape[1] != problem.horizon + 1:
+        steps = references.shape[1] - 1
+        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
+    tried = try_references(
+        references,
+        dynamics=problem.dynamics,
+        tracker=tracker,
+        scene=problem.scene,
+        start=problem.start,
+        disturbance=problem.disturbance,
+        rollouts=rollouts,
+        generator=context.generator("safety-rates: rollouts"),
+        within_limits=within_limits,
+        progress=context.progress,
+    )
+    parents = tuple(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file, *robot_files))
+    beside = ("safety.rollouts", "safety.within_limits")  # no piece of the proof depends on them
+    pieces = PartialResults.of(context, "safety-rates", without=beside, parents=parents)
+    proved = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
+    require_certified_safe(proved.safe, tried.closed_loop)
+    tubes = [proved.cells_of(r)[1].hull() for r in range(count)]
+    record = SafetyRates(
+        references=references.numpy(),
+        controls=tried.inverse.controls.numpy(),
+        residual=tried.inverse.residual.square().mean(1).sqrt().numpy(),
+        disturbances=DISTURBANCES,
+        open_loop=_trials(tried.open_loop),
+        closed_loop=_trials(tried.closed_loop),
+        verdict=tuple(str(v.outcome) for v in proved.verdicts),
+        step=np.array([v.step for v in proved.verdicts], dtype=np.int64),
+        constraint=tuple(v.constraint for v in proved.verdicts),
+        tube_lower=np.stack([tube.lower.numpy() for tube in tubes]),
+        tube_upper=np.stack([tube.upper.numpy() for tube in tubes]),
+        seconds=proved.seconds.numpy(),
+        propagator=proved.propagator,
+        rigorous=proved.rigorous,
+    )
+    path = context.write("safety-rates", record, (planner_file, tracker_file, *robot_files))
+    pieces.remove()
+    draw_beside(path, draw_safety, context.read("safety-rates"))
+    return path
+
+
+def _trials(found: Found) -> Trials:
+    """As stored."""
+    return Trials(clearance=found.clearance.numpy(), reached=found.reached.numpy(), nearest=found.nearest.numpy())
