@@ -19,7 +19,6 @@ from sagemp_cli.report.canvas import (
     Setting,
     blank_figure,
     draw_boxes,
-    draw_paths,
     draw_scene,
     goal_at_end,
     headline,
@@ -30,6 +29,7 @@ from sagemp_cli.report.canvas import (
     time_bar,
     tube_boxes,
 )
+from sagemp_cli.report.space import space_axes, space_tube
 from sagemp_cli.sets import Box
 from sagemp_cli.storage import Artifact, Certificate, Tubes
 
@@ -45,18 +45,23 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     record, setting = artifact.record, Setting.of(artifact.header.config)
     tubes, dynamics = record.tubes, setting.dynamics
     count, horizon = len(tubes.references), tubes.references.shape[1] - 1
-    shown = list(range(dynamics.state_dim))
-    rows = len(shown) + 1
-    figure = blank_figure(14, max(5.6, 1.28 * rows))
-    grid = figure.add_gridspec(rows, 2, width_ratios=(2.05, 1))
+    shown, flat = list(range(dynamics.state_dim)), len(dynamics.position) == 2
+    columns = 1 if dynamics.state_dim <= 8 else 2
+    rows = -(-(len(shown) + 1) // columns)
+    figure = blank_figure(12 + 2.2 * columns, max(5.6, 1.28 * rows))
+    grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
 
-    scene = figure.add_subplot(grid[:, 0])
-    draw_scene(scene, setting)
+    scene = figure.add_subplot(grid[:, 0]) if flat else space_axes(figure, grid[:, 0], setting)
+    if flat:
+        draw_scene(scene, setting)
     for r in range(count):
-        draw_tube(scene, setting, tubes, r)
+        if flat:
+            draw_tube(scene, setting, tubes, r)
+        else:
+            space_tube(scene, setting, tubes, r)
     for example in record.counterexamples:
-        path = example.states[:, setting.plane]
-        draw_paths(scene, path[None], colors=DANGER, linewidths=1.6, zorder=8)
+        path = example.states[:, list(dynamics.position)]
+        scene.plot(*path.T, color=DANGER, linewidth=1.6, zorder=8)
         scene.scatter(*path[example.step], s=46, marker="X", color=DANGER, edgecolor="white", linewidth=0.6, zorder=9)
     handles = [
         Line2D([], [], color=REFERENCE, lw=1.2, ls=(0, (4, 2)), label="reference"),
@@ -68,8 +73,8 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     time_bar(figure, scene, horizon * dynamics.dt)
 
     times, first = dynamics.dt * np.arange(horizon + 1), None
-    for row, state in enumerate(shown):
-        axes = figure.add_subplot(grid[row, 1], sharex=first)
+    for place, state in enumerate(shown):
+        axes = figure.add_subplot(grid[place % rows, 1 + place // rows], sharex=first)
         first = first or axes
         style_axes(axes, ylabel=setting.label(state))
         axes.tick_params(labelbottom=False)
@@ -78,7 +83,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
         for example in record.counterexamples:
             axes.plot(times, example.states[:, state], color=DANGER, linewidth=1.2, zorder=8)
         goal_at_end(axes, setting, state, times[-1])
-    axes = figure.add_subplot(grid[-1, 1], sharex=first)
+    axes = figure.add_subplot(grid[-1, -1], sharex=first)
     _clearances(axes, times, setting, tubes)
     axes.set_xlim(0, times[-1])
 
