@@ -19,7 +19,7 @@ from sagemp_cli.errors import ConfigError, did_you_mean
 ALLOWED_PACKAGES = ("dynamics", "planners", "trackers", "reachability", "experts")
 """Subpackages of sagemp_cli whose classes a config may name as ``_target_``."""
 
-FROM_DATA = ("state_dim", "control_dim", "horizon", "dt")
+FROM_DATA = ("state_dim", "state_names", "control_dim", "horizon", "dt")
 """Arguments that the stages take from the robot and the horizon; a config need not give them."""
 
 _PACKAGE = Path(__file__).resolve().parent

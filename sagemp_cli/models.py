@@ -13,9 +13,10 @@ from torch import nn
 
 from sagemp_cli.binding import FROM_DATA, build, target_class
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.planners.base import Planner
-from sagemp_cli.storage import Artifact, PlannerModel, TrackerModel, TrainingCurve
+from sagemp_cli.storage import Artifact, DynamicsModel, PlannerModel, TrackerModel, TrainingCurve
 from sagemp_cli.trackers.policy import Tracker
 from sagemp_cli.training import History
 
@@ -29,6 +30,7 @@ def data_arguments(section: Mapping[str, Any], where: str, dynamics: Dynamics, h
     """Those constructor arguments of a section's class that come from the robot and the horizon."""
     known = {
         "state_dim": dynamics.state_dim,
+        "state_names": list(dynamics.state_names),
         "control_dim": dynamics.control_dim,
         "horizon": horizon,
         "dt": dynamics.dt,
@@ -43,6 +45,20 @@ def planner_from(artifact: Artifact[PlannerModel]) -> Planner:
     section = {"_target_": artifact.header.config["planner"].get("_target_")}
     module = build(section, "planner", **extra)
     return _loaded(module, artifact.record.weights, artifact)
+
+
+def robot_from(artifact: Artifact[DynamicsModel], robot: Learned) -> Learned:
+    """A learned robot with the weights of the artifact, which are those of a robot of another section at your risk:
+    only names and shapes are compared.
+    """
+    return _loaded(robot, artifact.record.weights, artifact)
+
+
+def stand_in(config: Mapping[str, Any]) -> str:
+    """What takes the place of the real thing in an experiment's plans, in a few words; empty if nothing does."""
+    from_file = config.get("verify", {}).get("file") is not None
+    said = getattr(target_class(config["planner"], "planner"), "stand_in", None)
+    return "" if said is None or from_file else said(config["planner"])
 
 
 def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:

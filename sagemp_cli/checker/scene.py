@@ -38,15 +38,16 @@ class SafeSet:
             known(part, "lower", "upper", *more)
             return [float(v) for v in part["lower"]], [float(v) for v in part["upper"]]
 
-        known(scene, "workspace", "obstacles", "goal", "name", "description")
+        # Landmarks and what an obstacle looks like are for planners: nothing is proved of them.
+        known(scene, "workspace", "obstacles", "goal", "name", "description", "landmarks")
         obstacles = []
         for i, item in enumerate(scene["obstacles"]):
             name = str(item.get("name", f"obstacle {i}"))
             if item["kind"] == "ball":
-                known(item, "kind", "name", "center", "radius")
+                known(item, "kind", "name", "object", "center", "radius")
                 obstacles.append((name, "ball", [float(v) for v in item["center"]], float(item["radius"])))
             elif item["kind"] == "block":
-                obstacles.append((name, "block", *box(item, "kind", "name")))
+                obstacles.append((name, "block", *box(item, "kind", "name", "object")))
             else:
                 raise Unproved(f"obstacle '{name}' is of unknown kind '{item['kind']}'")
         return cls(box(scene["workspace"]), tuple(obstacles), box(scene["goal"]))

@@ -13,7 +13,7 @@ from sagemp_cli.cli.options import Json
 from sagemp_cli.errors import EXIT_CERTIFIED, EXIT_FALSIFIED, EXIT_UNKNOWN
 
 if TYPE_CHECKING:
-    from sagemp_cli.checker.check import Report
+    from sagemp_cli.checker.check import Finding, Report
 
 EXAMPLES = examples(
     "sagemp check artifacts/unicycle_node/certificate.h5",
@@ -52,18 +52,23 @@ def as_lines(report: Report) -> list[str]:
         f" {report.horizon} (the file claims {report.claimed})",
         *(f"  the file: {problem}" for problem in report.problems),
     ]
-    for f in report.findings:
-        if f.proved:
-            near = min(f.clearance, key=f.clearance.__getitem__)
-            goal = min(f.goal_margin, key=f.goal_margin.__getitem__, default=None)
-            inside = f", ends {f.goal_margin[goal]:.3g} inside the goal ({goal})" if goal else ""
-            lines.append(f"  reference {f.reference}: proved, keeps {f.clearance[near]:.3g} m from {near}{inside}")
-        else:
-            verb = "NOT PROVED" if f.claimed == "SAFE" else f.claimed
-            lines.append(f"  reference {f.reference}: {verb}: {f.reason}")
+    lines += [_line(f, "reference") for f in report.findings]
+    if report.true_model is not None:
+        lines.append("  the robot is a network learned from an analytical model; of that model itself:")
+        lines += [_line(f, "  reference") for f in report.true_model]
     took = f"checked in {report.seconds:.2f} s"
     lines.append(f"{took}; the proof took {report.proof_seconds:.2f} s" if report.proof_seconds > 0 else took)
     return lines
+
+
+def _line(f: Finding, what: str) -> str:
+    if not f.proved:
+        verb = "NOT PROVED" if f.claimed == "SAFE" else f.claimed
+        return f"  {what} {f.reference}: {verb}: {f.reason}"
+    near = min(f.clearance, key=f.clearance.__getitem__)
+    goal = min(f.goal_margin, key=f.goal_margin.__getitem__, default=None)
+    inside = f", ends {f.goal_margin[goal]:.3g} inside the goal ({goal})" if goal else ""
+    return f"  {what} {f.reference}: proved, keeps {f.clearance[near]:.3g} m from {near}{inside}"
 
 
 def as_data(report: Report) -> dict[str, Any]:
@@ -77,17 +82,19 @@ def as_data(report: Report) -> dict[str, Any]:
         "horizon": report.horizon,
         "cells": report.cells,
         "problems": list(report.problems),
-        "references": [
-            {
-                "reference": f.reference,
-                "claimed": f.claimed,
-                "proved": f.proved,
-                "reason": f.reason,
-                "clearance": dict(f.clearance),
-                "goal_margin": dict(f.goal_margin),
-            }
-            for f in report.findings
-        ],
+        "references": [_finding(f) for f in report.findings],
+        "true_model": None if report.true_model is None else [_finding(f) for f in report.true_model],
         "seconds": report.seconds,
         "proof_seconds": report.proof_seconds,
+    }
+
+
+def _finding(f: Finding) -> dict[str, Any]:
+    return {
+        "reference": f.reference,
+        "claimed": f.claimed,
+        "proved": f.proved,
+        "reason": f.reason,
+        "clearance": dict(f.clearance),
+        "goal_margin": dict(f.goal_margin),
     }

@@ -38,7 +38,7 @@ def validate(overrides: Overrides = None) -> None:
     for choice in choices:
         try:
             # Start, goal and disturbance belong to an experiment's robot, not to every robot there is.
-            require_sound_config(compose(choice), problem=not choice[0].startswith("dynamics="))
+            require_sound_config(compose(choice), problem=not choice[0].startswith(("dynamics=", "toy=")))
         except UsageError as e:
             wrong.append(f"{' '.join(choice)}: {e}")
     for line in wrong:
@@ -59,7 +59,7 @@ def list_options(overrides: Overrides = None) -> None:
         for option in options_of(group):
             mark = "*" if chosen.get(group) == option else " "
             note = _first_comment(resource_folder("conf") / group / f"{option}.yaml")
-            typer.echo(f"  {mark} {option:<28}{note}".rstrip())
+            typer.echo(f"  {mark} {option:<30}{note}".rstrip())
 
 
 def _first_comment(path: Path) -> str:

@@ -16,7 +16,9 @@ from sagemp_cli.cli import (
     gen_data,
     inspect,
     run,
+    safety_rates,
     status,
+    train_dynamics,
     train_planner,
     train_tracker,
     verify,
@@ -40,11 +42,13 @@ app = typer.Typer(
 _PIPELINE, _AROUND = "The pipeline", "Around it"
 for _name, _function, _examples, _panel in (
     ("gen-data", gen_data.gen_data, gen_data.EXAMPLES, _PIPELINE),
+    ("train-dynamics", train_dynamics.train_dynamics, train_dynamics.EXAMPLES, _PIPELINE),
     ("train-planner", train_planner.train_planner, train_planner.EXAMPLES, _PIPELINE),
     ("train-tracker", train_tracker.train_tracker, train_tracker.EXAMPLES, _PIPELINE),
     ("verify", verify.verify, verify.EXAMPLES, _PIPELINE),
     ("build-library", build_library.build_library, build_library.EXAMPLES, _PIPELINE),
     ("execute", execute.execute, execute.EXAMPLES, _PIPELINE),
+    ("safety-rates", safety_rates.safety_rates, safety_rates.EXAMPLES, _PIPELINE),
     ("run", run.run, run.EXAMPLES, _AROUND),
     ("check", check.check, check.EXAMPLES, _AROUND),
     ("status", status.status, status.EXAMPLES, _AROUND),

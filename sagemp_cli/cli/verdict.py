@@ -45,6 +45,10 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
             lines.append(f"  reference {i}: SAFE at all steps{near}")
         else:
             lines.append(f"  reference {i}: {item['verdict']} at step {item['step']} ({item['constraint']})")
+    if data["stand_in"]:
+        lines.append(f"  plans: of a {data['stand_in']}")
+    if data["learned"] is not None:
+        lines += _learned_lines(data["learned"])
     lines += [
         f"  controls: {c['control']} asks for {c['lower']:.3g} to {c['upper']:.3g} {c['unit']}, beyond its limits"
         f" {c['limits'][0]:.3g} to {c['limits'][1]:.3g}; the proof holds for actuators that follow"
@@ -62,8 +66,27 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
     return lines
 
 
+def _learned_lines(learned: dict[str, Any]) -> list[str]:
+    """What the verdict of a learned robot is about, and what is proved of its analytical model."""
+    lines = [f"  robot: a network learned from {learned['model']}; the verdict is about the network"]
+    true = learned["true_model"]
+    if true is None:
+        return lines
+    found = ", ".join(true["verdicts"]) if len(true["verdicts"]) < 9 else f"{true['certified']} of {true['of']} SAFE"
+    hint = "" if true["certified"] == true["of"] else "; more cells may prove it (verify.true_model.partitions)"
+    lines.append(f"  {learned['model']} itself: {found} ({true['cells']} cells){hint}")
+    if true["deviation"] is not None:
+        most = ", ".join(f"{d['largest']:.2g} {d['unit']} ({d['state']})" for d in true["deviation"])
+        late = ", ".join(f"{d['at_end']:.2g}" for d in true["deviation"])
+        near = "" if true["clearance"] is None else f"; keeps {true['clearance']:.3g} m from {true['nearest']}"
+        lines.append(f"    proved deviation of the network, folded into w: at most {most}; at the end {late}{near}")
+    return lines
+
+
 def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
     """The same as plain data."""
+    from sagemp_cli.models import stand_in
+
     record, tubes = certificate.record, certificate.record.tubes
     figure = certificate.path.with_suffix(".png")
     references = []
@@ -83,6 +106,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "verdict": record.verdict,
         "exit_code": exit_code(certificate),
         "experiment": certificate.header.experiment,
+        "stand_in": stand_in(certificate.header.config) or None,
         "horizon": int(tubes.references.shape[1] - 1),
         "propagator": tubes.propagator,
         "rigorous": tubes.rigorous,
@@ -90,6 +114,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "certified": sum(v == "SAFE" for v in tubes.verdict),
         "references": references,
         "controls": _controls(certificate),
+        "learned": _learned(certificate),
         "counterexamples": [
             {"reference": c.reference, "kind": c.kind, "step": c.step, "constraint": c.constraint, "depth": c.depth}
             for c in record.counterexamples
@@ -106,13 +131,13 @@ def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
 
     Nothing in the loop enforces limits: the paper penalises them in training; the proof is about the model as it is.
     """
-    from sagemp_cli.binding import target_class
+    from sagemp_cli.binding import build
 
-    tubes, section = certificate.record.tubes, certificate.header.config["dynamics"]
+    tubes = certificate.record.tubes
     safe = [i for i, verdict in enumerate(tubes.verdict) if verdict == "SAFE"]
     if not safe:
         return []
-    robot: Any = target_class(section, "dynamics")
+    robot: Any = build(certificate.header.config["dynamics"], "dynamics")
     lower, upper = tubes.control_lower[safe].min((0, 1)), tubes.control_upper[safe].max((0, 1))
     ranges = zip(robot.control_names, robot.control_units, lower.tolist(), upper.tolist(), strict=True)
     return [
@@ -126,8 +151,42 @@ def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
         }
         for (name, unit, least, most), limits in zip(
             ranges,
-            ([*pair] for pair in zip(section["control_lower"], section["control_upper"], strict=True)),
+            ([*pair] for pair in zip(robot.control_lower.tolist(), robot.control_upper.tolist(), strict=True)),
             strict=True,
         )
         if math.isfinite(least) and math.isfinite(most)
     ]
+
+
+def _learned(certificate: Artifact[Certificate]) -> dict[str, Any] | None:
+    """Of a learned robot what is proved of its analytical model; None for a robot of formulas."""
+    from sagemp_cli.binding import build
+
+    if certificate.record.dynamics is None:
+        return None
+    robot: Any = build(certificate.header.config["dynamics"], "dynamics")
+    found: dict[str, Any] = {"model": type(robot.analytical).__name__, "true_model": None}
+    true = certificate.record.true_model
+    if true is None:
+        return found
+    verdicts, clearance = list(true.tubes.verdict), true.tubes.clearance
+    safe = [i for i, verdict in enumerate(verdicts) if verdict == "SAFE"]
+    deviation, nearest = None, None
+    if safe:
+        largest, at_end = true.deviation[safe].max((0, 1)), true.deviation[safe, -1].max(0)
+        per = "/s" if robot.disturbance == "derivative" else ""
+        deviation = [
+            {"state": name, "unit": f"{unit}{per}", "largest": float(most), "at_end": float(late)}
+            for name, unit, most, late in zip(robot.state_names, robot.state_units, largest, at_end, strict=True)
+        ]
+        nearest = int(clearance[safe].min(0).argmin()) if clearance.shape[1] else None
+    found["true_model"] = {
+        "verdicts": verdicts,
+        "certified": len(safe),
+        "of": len(verdicts),
+        "cells": len(true.tubes.cell_reference),
+        "deviation": deviation,
+        "clearance": None if nearest is None else float(clearance[safe].min(0)[nearest]),
+        "nearest": None if nearest is None else true.tubes.constraint_names[nearest],
+    }
+    return found

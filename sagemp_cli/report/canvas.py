@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +16,10 @@ from matplotlib.patches import Circle, Rectangle
 
 from sagemp_cli.binding import build
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.models import stand_in
 from sagemp_cli.scenes import Ball, Scene, scene_from_mapping
 from sagemp_cli.sets import Box
+from sagemp_cli.storage import Header
 
 INK = "#1f2a37"
 MUTED = "#6b7785"
@@ -74,12 +77,21 @@ def blank_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=150, facecolor="white", layout="constrained")
 
 
+def subject(header: Header) -> str:
+    """The experiment's name, and what stands in for the planner if something does."""
+    instead = stand_in(header.config)
+    return f"{header.experiment} [plans of a {instead}]" if instead else header.experiment
+
+
 def headline(figure: Figure, text: str, subtitle: str, *, colour: str = INK) -> None:
-    """Two lines at the top left: what the figure says, and under which conditions."""
-    figure.get_layout_engine().set(rect=(0.004, 0.004, 0.988, 0.996 - 0.62 / figure.get_figheight()))
-    top = 1 - 0.12 / figure.get_figheight()
+    """What the figure says, and under which conditions: at the top left, the conditions wrapped to its width."""
+    lines = textwrap.wrap(subtitle, int(12.6 * figure.get_figwidth()))
+    height = figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0.004, 0.004, 0.988, 0.996 - (0.44 + 0.18 * len(lines)) / height))
+    top = 1 - 0.12 / height
     figure.text(0.012, top, text, ha="left", va="top", fontsize=14, fontweight="bold", color=colour)
-    figure.text(0.012, top - 0.27 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9.5, color=MUTED)
+    below = top - 0.27 / height
+    figure.text(0.012, below, "\n".join(lines), ha="left", va="top", fontsize=9.5, color=MUTED, linespacing=1.3)
 
 
 def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "") -> None:
@@ -98,7 +110,7 @@ def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "
 
 
 def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
-    """Workspace, obstacles and goal to scale; a three-dimensional scene is seen from above."""
+    """Workspace, obstacles, landmarks (dashed) and goal to scale; a three-dimensional scene is seen from above."""
     scene, (i, j) = setting.scene, setting.plane
     low, high = scene.workspace.lower.tolist(), scene.workspace.upper.tolist()
     style_axes(axes, xlabel=setting.label(i), ylabel=setting.label(j))
@@ -116,6 +128,12 @@ def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
             axes.add_patch(_box(obstacle.lower, obstacle.upper, facecolor=OBSTACLE, edgecolor="none", zorder=2))
         if names:
             axes.annotate(obstacle.name, center, ha="center", va="center", fontsize=7.5, color="white", zorder=2.5)
+    for landmark in scene.landmarks:
+        center = landmark.center[:2]
+        outline = {"fill": False, "edgecolor": MUTED, "linewidth": 1.1, "linestyle": (0, (2, 2))}
+        axes.add_patch(Circle(center, landmark.radius, zorder=2, **outline))
+        if names:
+            axes.annotate(landmark.name, center, ha="center", va="center", fontsize=7.5, color=MUTED, zorder=2.5)
     goal_low = np.maximum([scene.goal.lower[i], scene.goal.lower[j]], low[:2])
     goal_high = np.minimum([scene.goal.upper[i], scene.goal.upper[j]], high[:2])
     axes.add_patch(_box(goal_low, goal_high, facecolor=GOAL, alpha=0.16, edgecolor="none", zorder=1.5))

@@ -26,6 +26,7 @@ from sagemp_cli.report.canvas import (
     legend_above,
     shown_steps,
     style_axes,
+    subject,
     time_bar,
     tube_boxes,
 )
@@ -48,7 +49,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     shown, flat = list(range(dynamics.state_dim)), len(dynamics.position) == 2
     columns = 1 if dynamics.state_dim <= 8 else 2
     rows = -(-(len(shown) + 1) // columns)
-    figure = blank_figure(12 + 2.2 * columns, max(5.6, 1.28 * rows))
+    figure = blank_figure(12 + 2.2 * columns, max(7.2, 1.28 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
 
     scene = figure.add_subplot(grid[:, 0]) if flat else space_axes(figure, grid[:, 0], setting)
@@ -92,7 +93,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     headline(
         figure,
         f"{_SAYS.get(record.verdict, record.verdict)}",
-        f"{artifact.header.experiment}: {_deciding(tubes)}; {count} reference{'s' * (count > 1)}, "
+        f"{subject(artifact.header)}: {_deciding(tubes)}; {count} reference{'s' * (count > 1)}, "
         f"{cells} cell{'s' * (cells > 1)}, K = {horizon} ({horizon * dynamics.dt:g} s), "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; "
         f"{record.falsifier_rollouts} rollouts attacked it",
@@ -145,14 +146,17 @@ def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -
     upper = np.nan_to_num(upper, nan=np.inf, neginf=np.inf)
     found = setting.scene.clearances(Box(torch.from_numpy(lower), torch.from_numpy(upper))).amin(0).numpy()
     style_axes(axes, xlabel="time (s)", ylabel="clearance (m)")
-    for i, name in enumerate(tubes.constraint_names):
+    names = list(tubes.constraint_names)
+    if len(names) > 4:  # too many lines to tell apart
+        found, names = np.stack([found[:, 0], found[:, 1:].min(1)], axis=1), [names[0], "nearest obstacle"]
+    for i, name in enumerate(names):
         colour = MUTED if i == 0 else MODES[(i - 1) % len(MODES)]
         axes.plot(times, found[:, i], color=colour, linewidth=1.3, label=name)
     finite = found[np.isfinite(found)]
     bottom = min(0.0, float(finite.min())) if len(finite) else 0.0
     axes.axhline(0, color=DANGER, linewidth=1.1)
     axes.set_ylim(max(-1.0, bottom) - 0.1, 3.0)
-    legend(axes, loc="upper right", ncols=len(tubes.constraint_names), fontsize=7.5)
+    legend(axes, loc="upper right", ncols=len(names), fontsize=7.5)
 
 
 def _deciding(tubes: Tubes) -> str:

@@ -22,6 +22,7 @@ from sagemp_cli.report.canvas import (
     headline,
     legend_above,
     style_axes,
+    subject,
 )
 from sagemp_cli.storage import Artifact, Library
 
@@ -72,7 +73,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         figure,
         f"Library of {count} certified reference{'s' * (count > 1)}"
         + (f" ({record.wanted} wanted)" if count < record.wanted else ""),
-        f"{artifact.header.experiment}: {record.sampled} references sampled, "
+        f"{subject(artifact.header)}: {record.sampled} references sampled, "
         f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s; "
         f"certified clearance at least {tubes.clearance.min():.2f} m",

@@ -30,7 +30,7 @@ from sagemp_cli.storage import Artifact, PlannerModel
 SAMPLES = 80
 """References drawn for the picture, if the planner can afford them."""
 
-CURVES = ("collision-free", "in goal", "start error", "goal error", "share ")
+CURVES = ("collision-free", "passes over", "in goal", "start error", "goal error", "share ")
 """How the names of those validation figures begin that are shown: shares, and metres that are small."""
 
 

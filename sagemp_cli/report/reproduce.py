@@ -20,6 +20,7 @@ from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.library import draw_library
 from sagemp_cli.report.planner import draw_planner
 from sagemp_cli.report.rollouts import draw_rollouts
+from sagemp_cli.report.safety import draw_safety
 from sagemp_cli.report.training import draw_training
 from sagemp_cli.storage import (
     Certificate,
@@ -27,6 +28,7 @@ from sagemp_cli.storage import (
     Library,
     PlannerModel,
     Rollouts,
+    SafetyRates,
     TrackerModel,
     read_artifact,
 )
@@ -38,6 +40,7 @@ FIGURES: tuple[tuple[Callable[..., Figure], tuple[tuple[str, type], ...]], ...] 
     (draw_certificate, (("certificate", Certificate),)),
     (draw_library, (("library", Library),)),
     (draw_rollouts, (("rollouts", Rollouts), ("library", Library))),
+    (draw_safety, (("safety", SafetyRates),)),
 )
 """Each figure and the artifacts that it reads, by file name; the first one names the figure."""
 

@@ -21,6 +21,7 @@ from sagemp_cli.report.canvas import (
     headline,
     legend_above,
     style_axes,
+    subject,
 )
 from sagemp_cli.storage import Artifact, Library, Rollouts
 
@@ -78,7 +79,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
     headline(
         figure,
         f"{text} {total} rollouts stayed in their tube",
-        f"{artifact.header.experiment}: {len(record.chosen)} starts measured in X$_I$, closest of "
+        f"{subject(artifact.header)}: {len(record.chosen)} starts measured in X$_I$, closest of "
         f"{len(tubes.references)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
         "random and worst-case disturbances; "
         f"{safe} of {total} kept clear and reached the goal",

@@ -21,6 +21,7 @@ from sagemp_cli.report.canvas import (
     draw_scene,
     draw_start,
     headline,
+    subject,
 )
 from sagemp_cli.report.safety_table import CERTIFIED, SafetyRow, certified, percentage, safety_rows
 from sagemp_cli.storage import Artifact, SafetyRates, Trials
@@ -67,7 +68,7 @@ def draw_safety(artifact: Artifact[SafetyRates]) -> Figure:
         figure,
         f"Safe from all of X$_I$: {open_row.safe} of {open_row.sampled} plans open loop, {closed_row.safe} tracked, "
         f"{proof_row.safe} proved",
-        f"{artifact.header.experiment}: {open_row.rollouts} rollouts of each plan under each kind of disturbance w, "
+        f"{subject(artifact.header)}: {open_row.rollouts} rollouts of each plan under each kind of disturbance w, "
         f"those of least clearance shown; a plan is safe if all are. {record.propagator} proved {proof_row.safe} in "
         f"{record.seconds.sum():.2g} s",
     )

@@ -1,4 +1,7 @@
-"""Workspace, obstacles and goal: the safe set of the paper, with exact or outward-rounded box tests."""
+"""Workspace, obstacles and goal: the safe set of the paper, with exact or outward-rounded box tests.
+
+Beside them a scene may name landmarks, which are seen and spoken of but occupy nothing.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.scenes.objects import OBJECTS
 from sagemp_cli.sets import Box, round_down
 
 
@@ -20,6 +24,8 @@ class Ball:
     center: tuple[float, ...]
     radius: float
     name: str = "ball"
+    object: str = ""
+    """What it is drawn as, one of :data:`~sagemp_cli.scenes.objects.OBJECTS`; empty: a plain shape."""
 
     def signed_distance(self, p: Tensor) -> Tensor:
         """Distance of points ``(..., d)`` to the surface, negative inside (round to nearest)."""
@@ -46,6 +52,8 @@ class Block:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     name: str = "block"
+    object: str = ""
+    """As for a :class:`Ball`."""
 
     def signed_distance(self, p: Tensor) -> Tensor:
         """Distance of points ``(..., d)`` to the surface, negative inside (round to nearest)."""
@@ -63,6 +71,23 @@ Obstacle = Ball | Block
 
 
 @dataclass(frozen=True)
+class Landmark:
+    """A named thing that a planner may be told of ("pass over the burger"): drawn, but no obstacle.
+
+    Attributes:
+        object: what it is, one of :data:`~sagemp_cli.scenes.objects.OBJECTS`.
+        center: of its disc (or sphere), ``(d,)``.
+        radius: of its disc.
+        name: for figures.
+    """
+
+    object: str
+    center: tuple[float, ...]
+    radius: float
+    name: str = "landmark"
+
+
+@dataclass(frozen=True)
 class Scene:
     """The safe set ``S`` (workspace minus obstacles, over positions) and the goal ``X_G`` (over states).
 
@@ -70,11 +95,13 @@ class Scene:
         workspace: box of allowed positions, ``(d,)``.
         obstacles: occupied sets over positions.
         goal: box over the whole state ``(n,)``; dimensions that do not matter are infinite.
+        landmarks: named things that occupy nothing; no proof speaks of them.
     """
 
     workspace: Box
     obstacles: tuple[Obstacle, ...]
     goal: Box
+    landmarks: tuple[Landmark, ...] = ()
 
     def signed_distance(self, p: Tensor) -> Tensor:
         """Smallest distance of points ``(..., d)`` to any obstacle or the workspace's outside, negative if unsafe."""
@@ -113,37 +140,62 @@ def scene_from_mapping(data: Mapping[str, Any], *, state_dim: int, position_dim:
     """Build a scene from plain config data; every complaint names the key.
 
     Keys: ``workspace {lower, upper}``, ``obstacles`` (a list of ``{kind: ball, center, radius, name}`` or
-    ``{kind: block, lower, upper, name}``) and ``goal {lower, upper}`` over the state (``-inf``/``inf`` allowed).
+    ``{kind: block, lower, upper, name}``, either with ``object``, what it is drawn as), ``goal {lower, upper}`` over
+    the state (``-inf``/``inf`` allowed) and, optional, ``landmarks`` (a list of ``{object, center, radius, name}``).
 
     Raises:
         ConfigError: an unknown or missing key, or a value that is not what it should be.
     """
-    _require_keys("scene", data, ("workspace", "obstacles", "goal"), ("name", "description"))
-    if not isinstance(data["obstacles"], Sequence) or isinstance(data["obstacles"], str):
-        raise ConfigError(f"scene.obstacles must be a list, found {data['obstacles']!r}")
+    _require_keys("scene", data, ("workspace", "obstacles", "goal"), ("name", "description", "landmarks"))
+    for key in ("obstacles", "landmarks"):
+        if not isinstance(data.get(key, []), Sequence) or isinstance(data.get(key), str):
+            raise ConfigError(f"scene.{key} must be a list, found {data[key]!r}")
+    landmarks = data.get("landmarks", [])
     return Scene(
         _box("scene.workspace", data["workspace"], position_dim),
         tuple(_obstacle(f"scene.obstacles[{i}]", item, i, position_dim) for i, item in enumerate(data["obstacles"])),
         _box("scene.goal", data["goal"], state_dim),
+        tuple(_landmark(f"scene.landmarks[{i}]", item, i, position_dim) for i, item in enumerate(landmarks)),
     )
 
 
 def _obstacle(where: str, item: Any, index: int, size: int) -> Obstacle:
     kind = item.get("kind") if isinstance(item, Mapping) else None
     if kind == "ball":
-        _require_keys(where, item, ("kind", "center", "radius"), ("name",))
-        center = _finite(f"{where}.center", item["center"], size)
-        (radius,) = _finite(f"{where}.radius", [item["radius"]], 1)
-        if radius <= 0:
-            raise ConfigError(f"{where}.radius must be a positive number, found {item['radius']!r}")
-        return Ball(center, radius, str(item.get("name", f"obstacle {index}")))
+        _require_keys(where, item, ("kind", "center", "radius"), ("name", "object"))
+        center, radius = _disc(where, item, size)
+        return Ball(center, radius, str(item.get("name", f"obstacle {index}")), _object(where, item))
     if kind == "block":
-        _require_keys(where, item, ("kind", "lower", "upper"), ("name",))
+        _require_keys(where, item, ("kind", "lower", "upper"), ("name", "object"))
         low, high = _numbers(f"{where}.lower", item["lower"], size), _numbers(f"{where}.upper", item["upper"], size)
         if any(a >= b for a, b in zip(low, high, strict=True)):
             raise ConfigError(f"{where}: lower must lie below upper, found {list(low)} and {list(high)}")
-        return Block(low, high, str(item.get("name", f"obstacle {index}")))
+        return Block(low, high, str(item.get("name", f"obstacle {index}")), _object(where, item))
     raise ConfigError(f"{where}.kind must be 'ball' or 'block', found {kind!r}")
+
+
+def _landmark(where: str, item: Any, index: int, size: int) -> Landmark:
+    _require_keys(where, item, ("object", "center", "radius"), ("name",))
+    center, radius = _disc(where, item, size)
+    return Landmark(_object(where, item), center, radius, str(item.get("name", f"landmark {index}")))
+
+
+def _disc(where: str, item: Mapping[str, Any], size: int) -> tuple[tuple[float, ...], float]:
+    center = _finite(f"{where}.center", item["center"], size)
+    (radius,) = _finite(f"{where}.radius", [item["radius"]], 1)
+    if radius <= 0:
+        raise ConfigError(f"{where}.radius must be a positive number, found {item['radius']!r}")
+    return center, radius
+
+
+def _object(where: str, item: Mapping[str, Any]) -> str:
+    """What a thing is drawn as, empty where that is not said."""
+    if "object" not in item:
+        return ""
+    if item["object"] not in OBJECTS:
+        near = did_you_mean(str(item["object"]), OBJECTS)
+        raise ConfigError(f"{where}.object: nothing is drawn as {item['object']!r}{near}; known: {', '.join(OBJECTS)}")
+    return str(item["object"])
 
 
 def _box(where: str, part: Any, size: int) -> Box:

@@ -1,0 +1,28 @@
+"""The unicycle whose speed is a control (LaValle 2006, equation 13.18): three states, two controls."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+
+
+class KinematicUnicycle(Dynamics):
+    """``x = [px, py, theta]``, ``u = [v, turn rate]``.
+
+    ``px' = v cos(theta), py' = v sin(theta), theta' = turn rate``: a differential-drive robot whose wheels follow
+    their commands at once. The paper's tables list three entries for its VLM case, so this is the reading there;
+    where they list four it is :class:`~sagemp_cli.dynamics.unicycle.Unicycle`.
+    """
+
+    state_names = ("px", "py", "theta")
+    state_units = ("m", "m", "rad")
+    control_names = ("v", "turn_rate")
+    control_units = ("m/s", "rad/s")
+    position = (0, 1)
+
+    def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
+        theta, v = x[..., 2], u[..., 0]
+        return torch.stack([v * torch.cos(theta), v * torch.sin(theta), u[..., 1]], dim=-1)

@@ -1,0 +1,42 @@
+"""Every experiment, planner and robot at toy size through the command line, from nothing to a verdict and its check."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from sagemp_cli.cli.main import app
+from sagemp_cli.config import options_of
+
+SMALL = {  # beside effort=toy: networks and training of planners that the neural ODE's sizes do not fit
+    "planar_cfm": ("planner.width=16", "planner_training.steps=40"),
+    "planar_diffusion": ("planner.width=16", "planner_training.steps=40"),
+    "unicycle_node_learned": ("dynamics.hidden=[16,16]",),
+    "quadrotor_diffusion": ("planner.width=16", "planner_training.steps=40"),
+    "unicycle_vlm": ("planner_training.exercises=40", "planner_training.held_out=10", "planner_training.steps=30"),
+    "unicycle_vlm_avoid": ("planner_training.exercises=40", "planner_training.held_out=10", "planner_training.steps=30"),
+}
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory):
+    """One folder for all, so that experiments find what they take from each other."""
+    return tmp_path_factory.mktemp("artifacts")
+
+
+def sagemp(*arguments):
+    return CliRunner().invoke(app, arguments)
+
+
+@pytest.mark.parametrize("name", [e for e in options_of("experiment") if e not in ("unicycle_node", "unicycle_node_plain")])
+def test_an_experiment_runs_from_nothing_to_a_verdict(name, artifacts):
+    overrides = (f"experiment={name}", "effort=toy", f"artifacts={artifacts}", *SMALL.get(name, ()))
+    run = sagemp("run", *overrides, "--until", "verify")
+    assert run.exit_code in (0, 5, 10), run.output
+    certificate = artifacts / f"{name}-toy" / "certificate.h5"
+    said = json.loads(sagemp("verify", *overrides, "--json").stdout)
+    assert said["verdict"] == {0: "VERIFIED", 5: "UNKNOWN", 10: "FALSIFIED"}[run.exit_code]
+    if run.exit_code == 0:
+        assert sagemp("check", str(certificate)).exit_code == 0, "what was proved is proved again from the file alone"
+    again = sagemp("run", *overrides, "--until", "verify")
+    assert again.exit_code == run.exit_code and "making it" not in again.output, "everything is up to date"

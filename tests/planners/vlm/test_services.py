@@ -1,0 +1,218 @@
+"""Both services' protocols against a server on loopback: what is sent, and every way in which it can fail."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+
+import pytest
+import torch
+
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.planners.vlm import VLM, AnswerError, ServiceError
+
+KEY = "a-secret-key"
+GOOD = '{"waypoints": [[-0.3, -0.3], [0.3, -0.4]]}'
+
+
+def test_the_prompt_and_the_picture_are_sent_as_the_protocol_says(ask, server, provider):
+    ask(GOOD, temperature=0.5, model="some-model")
+    (request,) = server.requests
+    body = request["body"]
+    if provider == "gemini":
+        assert request["path"] == "/v1beta/models/some-model:generateContent"
+        assert request["headers"]["x-goog-api-key"] == KEY
+        text, image = body["contents"][0]["parts"]
+        text, png = text["text"], image["inline_data"]["data"]
+        assert body["generationConfig"]["temperature"] == 0.5
+    else:
+        assert request["path"] == "/chat/completions" and request["headers"]["authorization"] == f"Bearer {KEY}"
+        assert body["model"] == "some-model" and body["temperature"] == 0.5
+        text, image = body["messages"][0]["content"]
+        text, (head, png) = text["text"], image["image_url"]["url"].split(",")
+        assert head == "data:image/png;base64"
+    assert "except the burger" in text and "**Start Point (Green Dot):** [-0.75, -0.10]" in text
+    assert "**Goal Point (Red Dot):** [0.75, 0.07]" in text
+    assert base64.b64decode(png).startswith(b"\x89PNG")
+    assert KEY not in json.dumps(body) and KEY not in request["path"]
+
+
+def test_the_waypoints_become_a_reference_from_the_start_to_the_goals_middle(ask, table):
+    (reference,) = ask(GOOD)
+    assert reference.shape == (21, 3) and reference.dtype == torch.float64
+    assert reference[0].tolist() == [-1.5, -0.2, 0.0]
+    torch.testing.assert_close(reference[-1, :2], torch.tensor([1.5, 0.15], dtype=torch.float64))
+    for place in ([-0.6, -0.6], [0.6, -0.8]):
+        assert float((reference[:, :2] - torch.tensor(place)).norm(dim=-1).min()) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("", "the answer is empty"),
+        ("I am unable to do that.", "the model refuses: 'I am unable to do that.'"),
+        ('{"waypoints": []}', "lists no waypoints"),
+        (json.dumps({"waypoints": [[0, 0]] * 101}), "lists 101 waypoints, at most 100"),
+        ('{"waypoints": [[0, 7]]}', "waypoints[0] lies outside the image"),
+        ('{"waypoints": [["a", 7]]}', "waypoints[0][0] must be a finite number"),
+        ("turn left", "holds no JSON object"),
+    ],
+)
+def test_an_unusable_answer_is_an_error_in_one_line(ask, answer, message):
+    with pytest.raises(AnswerError, match=re.escape(message)) as caught:
+        ask(answer)
+    assert str(caught.value).startswith("no usable answer in 1 attempts: ")
+
+
+@pytest.mark.parametrize("wrapped", [f"Of course:\n{GOOD}\nEnjoy!", f"```json\n{GOOD}\n```"])
+def test_prose_and_fences_around_the_answer_change_nothing(ask, wrapped):
+    assert torch.equal(ask(wrapped), ask(GOOD))
+
+
+def test_after_an_unusable_answer_the_model_is_asked_again(ask, server):
+    ask("no", GOOD, attempts=2)
+    assert len(server.requests) == 2
+    seeds = [r["body"].get("seed", r["body"].get("generationConfig", {}).get("seed")) for r in server.requests]
+    assert seeds[0] != seeds[1]
+
+
+def test_a_service_that_blocks_the_answer_is_a_refusal(reply, ask, provider):
+    blocked = {
+        "gemini": {"promptFeedback": {"blockReason": "SAFETY"}},
+        "openai": {"choices": [{"message": {"content": None, "refusal": "SAFETY"}}]},
+    }[provider]
+    with pytest.raises(AnswerError, match=re.escape("the model refuses: 'refused by the")) as caught:
+        ask(reply(body=blocked))
+    assert "SAFETY" in str(caught.value)
+
+
+@pytest.mark.parametrize("status", [429, 500, 503])
+def test_a_temporary_failure_is_tried_again(reply, ask, server, status):
+    ask(reply(status, "later"), GOOD)
+    assert len(server.requests) == 2
+
+
+def test_retry_after_is_waited_for(reply, ask, clock):
+    ask(reply(429, "slow down", {"Retry-After": "0.4"}), GOOD)
+    assert clock() > 0.4
+
+
+def test_a_wait_beyond_the_time_limit_is_not_begun(reply, ask, server, clock):
+    message = "gave up after 1 requests, the next would come after the time limit of 2 s (429: slow down)"
+    with pytest.raises(ServiceError, match=re.escape(message)):
+        ask(reply(429, "slow down", {"Retry-After": "3600"}), GOOD, time_limit=2.0)
+    assert len(server.requests) == 1 and clock() < 2
+
+
+def test_a_service_that_stays_broken_is_given_up(reply, ask, server, provider):
+    broken = reply(500, {"error": {"message": "internal error"}})
+    with pytest.raises(ServiceError, match=re.escape(f"{provider}: gave up after 3 requests (500: internal error)")):
+        ask(broken)
+    assert len(server.requests) == 3
+
+
+def test_a_hanging_connection_is_given_up_in_time(reply, ask, provider, clock):
+    with pytest.raises(ServiceError, match=re.escape(f"{provider}: gave up after 2 requests (no reply within 0.2 s)")):
+        ask(reply(after=30.0), timeout=0.2, retries=1)
+    assert clock() < 5
+
+
+def test_a_server_that_is_not_there_is_said(provider, table, monkeypatch):
+    monkeypatch.setenv("GEMINI_API_KEY", KEY)
+    service = {"base_url": "http://127.0.0.1:1", "retries": 1, "backoff": 0.01}
+    planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider, service=service)
+    with pytest.raises(ServiceError, match="gave up after 2 requests") as caught:
+        planner.sample(torch.zeros(3), table.goal, scene=table, count=1, generator=torch.Generator())
+    assert "refused" in str(caught.value).lower()
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_a_wrong_key_is_said_at_once_and_never_shown(reply, ask, server, provider, status):
+    said = {"error": {"message": f"Incorrect API key provided: {KEY}"}}
+    variable = {"gemini": "GEMINI_API_KEY", "openai": "OPENAI_API_KEY"}[provider]
+    message = f"{provider}: the key in {variable} is refused ({status}: Incorrect API key provided: <key>)"
+    with pytest.raises(ServiceError, match=re.escape(message)) as caught:
+        ask(reply(status, said))
+    assert KEY not in str(caught.value) and len(server.requests) == 1
+
+
+def test_a_request_that_is_wrong_is_not_repeated(reply, ask, server, provider):
+    with pytest.raises(ServiceError, match=re.escape(f"{provider}: the request is refused (404: no such model)")):
+        ask(reply(404, {"error": {"message": "no such model"}}))
+    assert len(server.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("<html>gateway</html>", "the reply is not JSON, found b'<html>gateway</html>'"),
+        ("[1]", "the reply is not a JSON object, found list"),
+        ({"surprise": 1}, "the reply is not what the protocol says, found surprise"),
+    ],
+)
+def test_a_reply_that_is_no_reply_is_said(reply, ask, body, message):
+    with pytest.raises(ServiceError, match=re.escape(message)):
+        ask(reply(body=body))
+
+
+def test_a_redirect_is_not_followed_with_the_key(reply, ask, server):
+    with pytest.raises(ServiceError, match=re.escape("the request is refused (307")):
+        ask(reply(307, "", {"Location": f"{server.url}/elsewhere"}))
+    assert len(server.requests) == 1
+
+
+def test_without_a_key_the_public_service_is_not_asked(provider, table, monkeypatch):
+    variable = {"gemini": "GEMINI_API_KEY", "openai": "OPENAI_API_KEY"}[provider]
+    monkeypatch.delenv(variable, raising=False)
+    planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider)
+    with pytest.raises(ServiceError, match=f"needs a key in the environment variable {variable}"):
+        planner.sample(torch.zeros(3), table.goal, scene=table, count=1, generator=torch.Generator())
+
+
+def test_a_server_of_ones_own_needs_no_key(ask, server):
+    ask(GOOD, key=None)
+    assert "authorization" not in server.requests[0]["headers"]
+
+
+def test_the_cache_answers_again_without_the_service(reply, ask, server, tmp_path):
+    folder = tmp_path / "cache"
+    other = '{"waypoints": [[0.0, -0.6]]}'
+    first = ask(GOOD, other, count=2, cache=str(folder))
+    assert not torch.equal(first[0], first[1]) and len(list(folder.iterdir())) == 2
+    server.requests.clear()
+    again = ask(reply(500), count=2, cache=str(folder), retries=0)
+    assert torch.equal(first, again) and not server.requests
+    assert all(KEY not in path.read_text() for path in folder.iterdir())
+
+
+def test_the_cache_is_not_asked_for_another_seed_model_or_prompt(ask, server, tmp_path):
+    folder = str(tmp_path / "cache")
+    ask(GOOD, cache=folder)
+    for change in ({"seed": 1}, {"model": "other"}, {"prompt": "avoid_food"}, {"image_height": 40}):
+        server.requests.clear()
+        ask(GOOD, cache=folder, **change)
+        assert len(server.requests) == 1, change
+
+
+def test_a_damaged_cache_entry_is_named(ask, tmp_path):
+    folder = tmp_path / "cache"
+    ask(GOOD, cache=str(folder))
+    (entry,) = folder.iterdir()
+    entry.write_text("{")
+    with pytest.raises(ServiceError, match=re.escape(f"{entry}: is no cached answer; delete it to ask again")):
+        ask(GOOD, cache=str(folder))
+
+
+@pytest.mark.parametrize(
+    ("service", "message"),
+    [
+        ({"base_url": "file:///etc/passwd"}, "planner.service.base_url must begin with http:// or https://"),
+        ({"timeout": 0.0}, "timeout and time_limit must be positive seconds"),
+        ({"retries": -1}, "retries and temperature must not be negative"),
+        ({"modle": "x"}, "planner.service.modle: ServiceOptions has no such option (did you mean 'model'?)"),
+    ],
+)
+def test_wrong_options_of_a_service_are_named(service, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        VLM(state_dim=3, horizon=20, dt=0.5, provider="openai", service=service)
