@@ -6,6 +6,7 @@ It knows nothing of the package but the protocol of a loop: ``step(k, x, w)``, `
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -59,10 +60,18 @@ class Swarm:
     def state_dim(self) -> int:
         return self.robots * self.single.state_dim
 
-    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+    given_dim: ClassVar[int] = 2
+
+    def given(self, k: int) -> Tensor:
+        return self.single.given(k)
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, None]:
         n = self.single.state_dim
         states, disturbances = (
             torch.stack([v[..., n * i : n * i + n] for i in range(self.robots)], dim=-2) for v in (x, w)
         )
-        alone = torch.flatten(self.single.step(k, states, disturbances), -2)
-        return alone + torch.nn.functional.linear(x - self.rest, self.spring)
+        alone = torch.flatten(self.single.step_given(given, states, disturbances)[0], -2)
+        return alone + torch.nn.functional.linear(x - self.rest, self.spring), None
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return self.step_given(self.given(k), x, w)[0]

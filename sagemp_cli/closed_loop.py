@@ -8,6 +8,7 @@ start, references ``p_0..p_K`` with ``p_0`` the reference's start; step ``k = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -68,6 +69,17 @@ class ClosedLoop:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
         return self.dynamics.step(x, self.control(k, x), w)
 
+    given_dim: ClassVar[int] = 2
+
+    def given(self, k: int) -> Tensor:
+        """What step k has of its own: its window."""
+        return self.window(k)
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state and the control ``u_k``, for a window."""
+        u = self.tracker(given - x[..., None, :])
+        return self.dynamics.step(x, u, w), u
+
     def folded(self) -> FoldedLoop:
         """The same loop with the tracker's first layer folded onto the fixed references."""
         folds = [self.tracker.folded(self.window(k)) for k in range(self.horizon)]
@@ -119,5 +131,15 @@ class FoldedLoop:
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
-        h = torch.nn.functional.linear(x, self.weight) + self.biases[..., k, :]
-        return self.dynamics.step(x, self.tracker.after_first(h), w)
+        return self.step_given(self.given(k), x, w)[0]
+
+    given_dim: ClassVar[int] = 1
+
+    def given(self, k: int) -> Tensor:
+        """What step k has of its own: the bias of its first layer."""
+        return self.biases[..., k, :]
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state and the control, for a bias."""
+        u = self.tracker.after_first(torch.nn.functional.linear(x, self.weight) + given)
+        return self.dynamics.step(x, u, w), u

@@ -46,14 +46,15 @@ class PlanarQuadrotor(Dynamics):
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
-        phi, lift = x[..., 2], u[..., 0] / self.mass
+        phi, lift = x[..., 2], u[..., 0:1] / self.mass
+        push = lift * torch.stack([torch.sin(phi), torch.cos(phi)], dim=-1)
         return torch.stack(
             [
                 x[..., 3],
                 x[..., 4],
                 x[..., 5],
-                -lift * torch.sin(phi),
-                self.gravity + lift * torch.cos(phi),
+                -push[..., 0],
+                self.gravity + push[..., 1],
                 u[..., 1] / self.inertia,
             ],
             dim=-1,

@@ -53,14 +53,18 @@ class Quadrotor(Dynamics):
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
-        psi, theta, phi = x[..., 3], x[..., 4], x[..., 5]
-        p, q, r = x[..., 9], x[..., 10], x[..., 11]
-        sin_psi, cos_psi = torch.sin(psi), torch.cos(psi)
-        sin_theta, cos_theta = torch.sin(theta), torch.cos(theta)
-        sin_phi, cos_phi = torch.sin(phi), torch.cos(phi)
-        turn = (q * sin_phi + r * cos_phi) / cos_theta
+        p, q, r = (x[..., i] for i in (9, 10, 11))
+        sin, cos = torch.sin(x[..., 3:6]), torch.cos(x[..., 3:6])
+        sin_psi, sin_theta, sin_phi = (sin[..., i] for i in range(3))
+        cos_psi, cos_theta, cos_phi = (cos[..., i] for i in range(3))
+        q_sin, r_cos, q_cos, r_sin, q_r, p_r, p_q, tilt, across, along, upright = _products(
+            *((q, sin_phi), (r, cos_phi), (q, cos_phi), (r, sin_phi), (q, r), (p, r), (p, q)),
+            *((cos_phi, sin_theta), (sin_phi, sin_psi), (sin_phi, cos_psi), (cos_phi, cos_theta)),
+        )
+        turn = (q_sin + r_cos) / cos_theta
         lift = u[..., 0] / self.mass
-        tilt = cos_phi * sin_theta
+        tilt_cos, tilt_sin, turn_sin = _products((tilt, cos_psi), (tilt, sin_psi), (turn, sin_theta))
+        push_x, push_y, push_z = _products((lift, across + tilt_cos), (lift, tilt_sin - along), (lift, upright))
         i_x, i_y, i_z = self.inertia
         return torch.stack(
             [
@@ -68,14 +72,21 @@ class Quadrotor(Dynamics):
                 x[..., 7],
                 x[..., 8],
                 turn,
-                q * cos_phi - r * sin_phi,
-                p + turn * sin_theta,
-                lift * (sin_phi * sin_psi + tilt * cos_psi),
-                lift * (tilt * sin_psi - sin_phi * cos_psi),
-                self.gravity + lift * (cos_phi * cos_theta),
-                (i_y - i_z) / i_x * (q * r) + u[..., 1] / i_x,
-                (i_z - i_x) / i_y * (p * r) + u[..., 2] / i_y,
-                (i_x - i_y) / i_z * (p * q) + u[..., 3] / i_z,
+                q_cos - r_sin,
+                p + turn_sin,
+                push_x,
+                push_y,
+                self.gravity + push_z,
+                (i_y - i_z) / i_x * q_r + u[..., 1] / i_x,
+                (i_z - i_x) / i_y * p_r + u[..., 2] / i_y,
+                (i_x - i_y) / i_z * p_q + u[..., 3] / i_z,
             ],
             dim=-1,
         )
+
+
+def _products(*pairs: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """The product of each pair, all in one operation: for a set of states many cost hardly more than one."""
+    left, right = (torch.stack(factors, dim=-1) for factors in zip(*pairs, strict=True))
+    products = left * right
+    return [products[..., i] for i in range(len(pairs))]

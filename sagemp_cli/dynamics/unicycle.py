@@ -23,5 +23,6 @@ class Unicycle(Dynamics):
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
-        theta, v = x[..., 2], x[..., 3]
-        return torch.stack([v * torch.cos(theta), v * torch.sin(theta), u[..., 0], u[..., 1]], dim=-1)
+        theta, v = x[..., 2], x[..., 3:4]
+        heading = torch.stack([torch.cos(theta), torch.sin(theta)], dim=-1)
+        return torch.cat([v * heading, u], dim=-1)

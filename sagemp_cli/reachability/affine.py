@@ -6,11 +6,13 @@ The set of states at step k is a zonotope ``c_k + G_k [-1, 1]^M``. Each step is 
     x_{k+1} in c + J_x (x_k - c_k) + J_w (w_k - c_w) + L [-1, 1]^l + [-e, e]
 
 and with it ``G_{k+1} = [J_x G_k, J_w diag(r_w), L, diag(e)]``. Every error keeps its correlation, which the
-feedback then contracts. Rounding is included (last block), so the tube encloses every real-arithmetic rollout.
+feedback then contracts, until it is negligible (:mod:`sagemp_cli.reachability.reduction`). Rounding is included (last
+block), so the tube encloses every real-arithmetic rollout.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -24,6 +26,8 @@ import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the 
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine_form import AffineForm, Hints, StepFrame
+from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable
+from sagemp_cli.reachability.planned_run import planned_run
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.reduction import reduce_generators
@@ -38,14 +42,16 @@ class AffineRun:
     Attributes:
         tube: bounds per step, ``(*batch, K+1, n)``.
         bands: per step, the bands used, in the order of evaluation.
-        kept: per step, the mask of the generators kept ``(*batch, M)``; empty if none were ever dropped.
+        kept: per step, the mask of the generators kept, ``(M,)`` or ``(*batch, M)``.
         steps: per step, the form of the next state (and in its frame, what went into it); empty unless asked for.
+        controls: per step, bounds of the controls; empty unless asked for.
     """
 
     tube: Tube
     bands: list[list[tuple[str, Band]]] = field(repr=False)
     kept: list[Tensor] = field(default_factory=list, repr=False)
     steps: list[AffineForm] = field(default_factory=list, repr=False)
+    controls: list[tuple[Tensor, Tensor]] = field(default_factory=list, repr=False)
 
     def recording(self) -> Recording:
         """What a certificate keeps of the run."""
@@ -57,7 +63,7 @@ class Affine:
     """Forward affine arithmetic, rigorous.
 
     Attributes:
-        symbols: most generators kept between steps (None: all); the excess is boxed, soundly.
+        symbols: most generators kept between steps (None: all that are not negligible); the others are boxed, soundly.
     """
 
     symbols: int | None = None
@@ -81,16 +87,15 @@ class Affine:
     @torch.no_grad()
     def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
         """As :meth:`propagate_with_controls`, with what a certificate keeps of the proof."""
-        watched = _Watched(loop, [])
-        run = self._fast_run(watched, start, disturbance)
-        lower, upper = (torch.stack(side, dim=-2) for side in zip(*watched.controls, strict=True))
+        run = self._fast_run(loop, start, disturbance, watch=True)
+        lower, upper = (torch.stack(side, dim=-2) for side in zip(*run.controls, strict=True))
         bad = torch.isnan(lower) | torch.isnan(upper)
         return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
 
-    def _fast_run(self, loop: Loop, start: Box, disturbance: Box) -> AffineRun:
+    def _fast_run(self, loop: Loop, start: Box, disturbance: Box, watch: bool = False) -> AffineRun:
         """:meth:`run` without autograd's bookkeeping; the tube is of ordinary tensors."""
         with torch.inference_mode():
-            run = self.run(loop, start, disturbance)
+            run = self.run(loop, start, disturbance, watch=watch)
         return dataclasses.replace(run, tube=Tube(run.tube.lower.clone(), run.tube.upper.clone()))
 
     def run(
@@ -102,32 +107,46 @@ class Affine:
         horizon: int | None = None,
         keep_steps: bool = False,
         hints: Sequence[Hints] | None = None,
+        watch: bool = False,
     ) -> AffineRun:
         """Propagate and keep the bands (differentiable where autograd is on).
+
+        A loop that can be folded is, where autograd is off: see :mod:`sagemp_cli.reachability.planned_run`.
 
         Args:
             loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
             horizon: steps; the loop's by default.
             keep_steps: keep every step's form, for a backward pass.
             hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
+            watch: bound the controls, of a :class:`~sagemp_cli.closed_loop.ClosedLoop`.
         """
+        steps = loop.horizon if horizon is None else horizon
+        if isinstance(loop, FoldableLoop) and not torch.is_grad_enabled():
+            wanted = {"symbols": self.symbols, "hints": hints, "keep_steps": keep_steps, "watch": watch}
+            with contextlib.suppress(NotFoldable):
+                found = planned_run(loop, start, disturbance, steps, **wanted)
+                return AffineRun(found.tube, found.bands, found.kept, found.steps, found.controls)
         center, reach = start.center, start.radius
         generators = torch.diag_embed(reach)
         lowers, uppers = [start.lower], [start.upper]
         w_center, w_radius = disturbance.center, disturbance.radius
-        bands, masks, kept_steps = [], [], []
-        steps = loop.horizon if horizon is None else horizon
+        bands, masks, kept_steps, controls = [], [], [], []
         for k in range(steps):
             frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
-            after = loop.step(k, frame.state(center), frame.disturbance(w_center))
+            x, w = frame.state(center), frame.disturbance(w_center)
+            if watch:
+                u = loop.control(k, x)
+                controls.append(u.bounds())
+                after = loop.dynamics.step(x, u, w)
+            else:
+                after = loop.step(k, x, w)
             bands.append(frame.bands)
             center, generators = _advance(after)
             if keep_steps:
                 frame.condense()
                 kept_steps.append(after)
-            if self.symbols is not None:
-                generators, mask = reduce_generators(generators, self.symbols)
-                masks.append(mask)
+            generators, mask = reduce_generators(generators, self.symbols)
+            masks.append(mask)
             growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
             reach = generators.abs().sum(-1) * growth
             spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
@@ -136,28 +155,7 @@ class Affine:
             if not bool(torch.isfinite(reach).all()):
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
         tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
-        return AffineRun(tube, bands, masks, kept_steps)
-
-
-@dataclass(frozen=True)
-class _Watched:
-    """A closed loop that notes the bounds of its controls as it steps."""
-
-    loop: ClosedLoop
-    controls: list[tuple[Tensor, Tensor]]
-
-    @property
-    def horizon(self) -> int:
-        return self.loop.horizon
-
-    @property
-    def state_dim(self) -> int:
-        return self.loop.state_dim
-
-    def step(self, k: int, x: AffineForm, w: AffineForm) -> AffineForm:
-        u = self.loop.control(k, x)
-        self.controls.append(u.bounds())
-        return self.loop.dynamics.step(x, u, w)
+        return AffineRun(tube, bands, masks, kept_steps, controls)
 
 
 def _advance(after: AffineForm) -> tuple[Tensor, Tensor]:

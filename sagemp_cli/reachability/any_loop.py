@@ -6,12 +6,13 @@ import dataclasses
 import importlib
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
+from sagemp_cli.reachability.folding import NotFoldable
 from sagemp_cli.reachability.partition import parse_partitions, partition, uncertain_dimensions
 from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.reachability.tracing.probing import Step, agree, probe, reproduced
@@ -48,6 +49,18 @@ class RecordedLoop:
     def step(self, k: int, x: Any, w: Any) -> Any:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``, tensors or sets."""
         return self.programs[k if len(self.programs) > 1 else 0](x, w)
+
+    given_dim: ClassVar[int] = 1
+
+    def given(self, k: int) -> Tensor:
+        """What step k has of its own: nothing, where one program serves all steps."""
+        if len(self.programs) > 1:
+            raise NotFoldable
+        return torch.zeros(0, dtype=torch.float64)
+
+    def step_given(self, given: Any, x: Any, w: Any) -> tuple[Any, None]:
+        """The next state, by the program for all steps."""
+        return self.programs[0](x, w), None
 
 
 def reach(

@@ -27,11 +27,13 @@ class Operation(NamedTuple):
         band: around one line.
         lines: one below and one above.
         value_range: of the values.
+        arrays: whether the band takes numpy's arrays too.
     """
 
     band: Callable[..., Band]
     lines: Callable[..., Lines]
     value_range: Callable[..., tuple[Tensor, Tensor]]
+    arrays: bool = False
 
 
 class Form:

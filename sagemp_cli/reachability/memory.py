@@ -49,7 +49,7 @@ def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
     With n states, d disturbances, M generators at the last step, E entries of nonlinear operations a step (H of the
     widest one) and v = n + d + E variables a step, in numbers of 8 bytes:
 
-    - kept: ``2 (K+1) n + 2 K m + 3 K E`` and, where generators are reduced, a bit per generator and step;
+    - kept: ``2 (K+1) n + 2 K m + 3 K E`` and a bit per generator and step, as many as if none were negligible;
     - working, times :data:`HEAP`, of ``affine``: ``M (6 n + 3 H) + 12 v^2 + 2 kept``;
     - of ``crown`` and ``best``: as ``affine``, ``K (3 v^2 + 2 v n)`` for the steps and ``6 rows v`` for the sweep;
     - of ``interval``: ``40 v + 2 kept``.
@@ -64,7 +64,7 @@ def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
     generators = n + steps * v  # each step adds its disturbances, its relaxations and a column of rounding per state
     generators = generators if symbols is None else min(generators, max(symbols, n + 1) + v)
     kept = 2 * (steps + 1) * n + 2 * steps * m + 3 * steps * entries
-    kept += 0 if symbols is None else steps * generators / 64
+    kept += steps * generators / 64
     working = {
         "affine": generators * (6 * n + 3 * widest) + 12 * v**2 + 2 * kept,
         "interval": 40 * v + 2 * kept,

@@ -36,7 +36,7 @@ class Recording:
 
     @staticmethod
     def of(bands: Sequence[Sequence[tuple[str, Band]]], batch: torch.Size, kept: Sequence[Tensor]) -> Recording:
-        """From a run's bands per step and, where generators were reduced, its masks ``(*batch, columns)`` per step."""
+        """From a run's bands and masks of kept generators, ``(columns,)`` or ``(*batch, columns)``, per step."""
 
         def stacked(part: int) -> Tensor:
             def entries(step: Sequence[tuple[str, Band]]) -> Tensor:
@@ -52,7 +52,7 @@ class Recording:
             slope=stacked(0),
             offset=stacked(1),
             radius=stacked(2),
-            kept=_packed(kept) if len(kept) else None,
+            kept=_packed(kept, batch) if len(kept) else None,
         )
 
     def select(self, index: Tensor) -> Recording:
@@ -65,11 +65,14 @@ class Recording:
         known = [p for p in parts if p is not None]
         if len(known) < len(parts) or len({(p.operations, p.widths, p.kept is None) for p in known}) != 1:
             return None
+        size = max(0 if p.kept is None else p.kept.shape[-1] for p in known)  # cells of other chunks keep others
         return Recording(
             known[0].operations,
             known[0].widths,
             *(torch.cat([getattr(p, name) for p in known]) for name in ("slope", "offset", "radius")),
-            kept=None if known[0].kept is None else torch.cat([p.kept for p in known if p.kept is not None]),
+            kept=None
+            if known[0].kept is None
+            else torch.cat([_padded(p.kept, size) for p in known if p.kept is not None]),
         )
 
     def _map(self, change) -> Recording:
@@ -84,9 +87,14 @@ def _own(band: Band, batch: torch.Size) -> torch.Size:
     return torch.broadcast_shapes(*(part.shape for part in band))[len(batch) :]
 
 
-def _packed(masks: Sequence[Tensor]) -> Tensor:
+def _packed(masks: Sequence[Tensor], batch: torch.Size) -> Tensor:
     """Masks of several lengths as rows of bits, least significant first, padded with zeros."""
     size = -(-max(m.shape[-1] for m in masks) // 8)
-    rows = torch.stack([torch.nn.functional.pad(m, (0, 8 * size - m.shape[-1])) for m in masks], dim=-2)
+    rows = torch.stack([_padded(m, 8 * size).expand(*batch, -1) for m in masks], dim=-2)
     weights = 2 ** torch.arange(8, dtype=torch.int64)
     return (rows.unflatten(-1, (size, 8)).long() * weights).sum(-1).to(torch.uint8)
+
+
+def _padded(rows: Tensor, size: int) -> Tensor:
+    """Rows of that length, filled up with zeros."""
+    return torch.nn.functional.pad(rows, (0, size - rows.shape[-1]))

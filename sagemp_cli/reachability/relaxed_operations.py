@@ -44,9 +44,10 @@ def _scalar(name: str, operation: Operation, *functions: Any) -> None:
         return x.relaxed(name, operation)
 
 
-_SINE = Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range)
-_COSINE = Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range)
-_LEAKY_RELU, _SOFTPLUS, _ELU, _POWER, _CLAMP = map(_of, (_leaky_relu, _softplus, _elu, _power, _clamp))
+_SINE = Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range, arrays=True)
+_COSINE = Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range, arrays=True)
+_LEAKY_RELU = Operation(_leaky_relu.band, _leaky_relu.lines, _leaky_relu.value_range, arrays=True)
+_SOFTPLUS, _ELU, _POWER, _CLAMP = map(_of, (_softplus, _elu, _power, _clamp))
 
 _scalar("sin", _SINE, torch.sin, torch.Tensor.sin)
 _scalar("cos", _COSINE, torch.cos, torch.Tensor.cos)

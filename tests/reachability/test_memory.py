@@ -53,7 +53,7 @@ def test_the_estimate_is_above_the_measured_peak_and_not_far_above():
     done = subprocess.run([sys.executable, "-c", MEASURE], capture_output=True, text=True, timeout=120, check=True)
     found = json.loads(done.stdout)
     working, kept = found["estimate"]
-    assert kept == pytest.approx(found["kept"], rel=0.02)
+    assert found["kept"] <= kept <= 1.3 * found["kept"]
     assert 0.05 * working < found["measured"] < working + kept
 
 
@@ -74,12 +74,12 @@ def needs(propagator, steps=50):
 def test_reduced_symbols_take_less_and_longer_horizons_more():
     short, long, reduced = needs(Affine()), needs(Affine(), 500), needs(Affine(symbols=100), 500)
     assert short.working < reduced.working < 0.3 * long.working
-    assert 8 * short.working < long.working < 10 * short.working
+    assert 8 * short.working < long.working < 12 * short.working
     assert short.kept < 0.15 * long.kept
 
 
-@pytest.mark.parametrize("symbols", [None, 30])
-def test_what_is_kept_is_counted_exactly(symbols):
+@pytest.mark.parametrize(("symbols", "above"), [(30, 1.02), (None, 1.1)])
+def test_what_is_kept_is_counted_as_if_no_generator_were_negligible(symbols, above):
     work = prover(Affine(symbols=symbols))
     reference = torch.zeros(1, 21, 4, dtype=torch.float64)
     tubes = work.prove(
@@ -88,7 +88,7 @@ def test_what_is_kept_is_counted_exactly(symbols):
     sizes = {name: array.nbytes for name, array in tubes.arrays().items()}
     for name in ("cell_reference", "cell_lower", "cell_upper", "seconds", "operations", "widths"):
         del sizes[name]
-    assert footprint(work, reference[0], START).kept == pytest.approx(sum(sizes.values()), rel=0.02)
+    assert 0.98 * sum(sizes.values()) <= footprint(work, reference[0], START).kept <= above * sum(sizes.values())
 
 
 def test_as_many_cells_at_once_as_the_budget_allows():

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
+
+from sagemp_cli.reachability.relaxations.functions import functions_of
 
 UNIT = 2.0**-53
 """Unit roundoff of float64: a correctly rounded operation errs by at most ``UNIT`` times its result."""
@@ -33,12 +34,8 @@ def settled(slope: Tensor, offset: Tensor, radius: Tensor) -> Band:
     A relaxation's radius is not finite if the interval or anything computed from it is not, so the radius alone is
     asked: one sum in the usual case.
     """
-    if math.isfinite(radius.detach().sum().item()):
+    if math.isfinite(radius.sum().item()):
         return Band(slope, offset, radius)
-    finite = torch.isfinite(radius)
-    zero = torch.zeros_like(radius)
-    return Band(
-        torch.where(finite, slope, zero),
-        torch.where(finite, offset, zero),
-        torch.where(finite, radius, torch.full_like(radius, math.inf)),
-    )
+    m = functions_of(radius)
+    finite = m.isfinite(radius)
+    return Band(m.where(finite, slope, 0.0), m.where(finite, offset, 0.0), m.where(finite, radius, math.inf))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.value_range import increasing, outward
 
@@ -50,10 +51,9 @@ def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: T
     Ends on the far side of the kink are moved to the kink, or just past it: then no product below can underflow and
     no quotient is 0/0.
     """
-    low, high = lower.clamp(max=-TINY), upper.clamp(min=TINY)
+    m = functions_of(lower)
+    low, high = m.clamp(lower, max=-TINY), m.clamp(upper, min=TINY)
     if slope is None:
-        chord = (high - negative_slope * low) / (high - low)
-        slope = chord.clamp(negative_slope, 1.0)
-        slope = torch.where(lower >= 0, torch.ones_like(slope), slope)
-        slope = torch.where(upper <= 0, torch.full_like(slope, negative_slope), slope)
-    return slope, torch.maximum((negative_slope - slope) * low, (1.0 - slope) * high)
+        slope = m.clamp((high - negative_slope * low) / (high - low), negative_slope, 1.0)
+        slope = m.where(lower >= 0, 1.0, m.where(upper <= 0, negative_slope, slope))
+    return slope, m.maximum((negative_slope - slope) * low, (1.0 - slope) * high)

@@ -11,15 +11,18 @@ cubic), so the chord from that end to there is as good to higher order. Wide int
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.functions import functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import (
     Excess,
@@ -31,7 +34,7 @@ from sagemp_cli.reachability.relaxations.pieces import (
 )
 
 ULPS = 4
-"""Margin for ``torch.sin, cos, acos, asin``, in ulps of 1; tested against ball arithmetic."""
+"""Margin for torch's and numpy's ``sin, cos, acos, asin``, in ulps of 1; tested against ball arithmetic."""
 
 # an extremum this far outside (in turns) is counted too: its excess exceeds the end's by at most (2 pi slack)^2 / 2
 _SLACK = 1e-7
@@ -47,21 +50,50 @@ class _Wave(NamedTuple):
     value: Callable[[Tensor], Tensor]
     derivative: Callable[[Tensor], Tensor]
     turns: Callable[[Tensor], tuple[Tensor, Tensor]]
-    inflection: float
+    inflection: float | np.ndarray
 
 
 def _sine_turns(slope: Tensor) -> tuple[Tensor, Tensor]:
-    turn = torch.acos(slope)
+    turn = functions_of(slope).acos(slope)
     return turn, -turn
 
 
 def _cosine_turns(slope: Tensor) -> tuple[Tensor, Tensor]:
-    turn = torch.asin(slope)
+    turn = functions_of(slope).asin(slope)
     return -turn, math.pi + turn
 
 
-_SINE = _Wave(torch.sin, torch.cos, _sine_turns, 0.0)
-_COSINE = _Wave(torch.cos, lambda x: -torch.sin(x), _cosine_turns, 0.5 * math.pi)
+_SINE = _Wave(lambda x: functions_of(x).sin(x), lambda x: functions_of(x).cos(x), _sine_turns, 0.0)
+_COSINE = _Wave(lambda x: functions_of(x).cos(x), lambda x: -functions_of(x).sin(x), _cosine_turns, 0.5 * math.pi)
+
+
+def _both(first: Callable[[Any, Any], Any], second: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+    """One function for sines and another for cosines, of values ``(..., 2, B, e)``."""
+
+    def function(x: Any) -> Any:
+        m = functions_of(x)
+        out = first(m, x)
+        out[..., 1, :, :] = second(m, x[..., 1, :, :])
+        return out
+
+    return function
+
+
+def _both_turns(slope: Any) -> tuple[Any, Any]:
+    m = functions_of(slope)
+    turn = m.acos(slope)
+    turn[1] = -m.asin(slope[1])
+    other = -turn
+    other[1] += math.pi
+    return turn, other
+
+
+_BOTH = _Wave(
+    _both(lambda m, x: m.sin(x), lambda m, x: m.cos(x)),
+    _both(lambda m, x: m.cos(x), lambda m, x: -m.sin(x)),
+    _both_turns,
+    np.array([_SINE.inflection, _COSINE.inflection])[:, None, None],
+)
 
 
 def sine_band(lower: Tensor, upper: Tensor) -> Band:
@@ -72,6 +104,15 @@ def sine_band(lower: Tensor, upper: Tensor) -> Band:
 def cosine_band(lower: Tensor, upper: Tensor) -> Band:
     """Band of ``cos`` on ``[lower, upper]``."""
     return _band(_COSINE, lower, upper)
+
+
+def sine_and_cosine_bands(lower: np.ndarray, upper: np.ndarray) -> tuple[Band, Band]:
+    """Bands of ``sin`` on the first and of ``cos`` on the second of two arrays of intervals, ``(2, B, e)``.
+
+    Both at once take as long as one of them.
+    """
+    slope, offset, radius = _band(_BOTH, lower, upper)
+    return Band(slope[0], offset[0], radius[0]), Band(slope[1], offset[1], radius[1])
 
 
 def sine_lines(lower: Tensor, upper: Tensor) -> Lines:
@@ -95,7 +136,8 @@ def cosine_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _band(wave: _Wave, lower: Tensor, upper: Tensor) -> Band:
-    ends = torch.stack([lower, upper])
+    m = functions_of(lower)
+    ends = m.stack([lower, upper])
     values = wave.value(ends)
     width = upper - lower
     bent = (values[0] * values[1] < 0) & (width > _NARROW) | (width > _WIDE)
@@ -103,18 +145,16 @@ def _band(wave: _Wave, lower: Tensor, upper: Tensor) -> Band:
         slope = _chord(wave, *_shortened(wave, lower, upper))
         wide = width > _WIDE
         if bool(wide.any()):
-            slope = torch.where(wide, _searched(wave, ends, values, radius_objective), slope)
+            slope = m.where(wide, on_tensors(lambda e, v: _searched(wave, e, v, radius_objective), ends, values), slope)
     else:
         slope = _chord(wave, lower, upper)
     tops, bottoms, _ = _extrema(wave, slope, ends, values)
-    most, least = tops.amax(0), bottoms.amin(0)
-    size = ends.abs().amax(0)
+    most, least = m.amax(tops, 0), m.amin(bottoms, 0)
+    size = m.amax(abs(ends), 0)
     offset, radius = 0.5 * (most + least), 0.5 * (most - least) + _margin(size)
     if not bool((size <= _FAR).all()):
-        far = (size > _FAR) & torch.isfinite(ends).all(0)
-        zero = torch.zeros_like(size)
-        slope, offset = torch.where(far, zero, slope), torch.where(far, zero, offset)
-        radius = torch.where(far, zero + 1.0, radius)
+        far = (size > _FAR) & m.isfinite(lower) & m.isfinite(upper)
+        slope, offset, radius = m.where(far, 0.0, slope), m.where(far, 0.0, offset), m.where(far, 1.0, radius)
     return settled(slope, offset, radius)
 
 
@@ -156,17 +196,19 @@ def _margin(size: Tensor) -> Tensor:
 
 def _chord(wave: _Wave, lower: Tensor, upper: Tensor) -> Tensor:
     """Slope of the chord ``f'(middle) sin(w / 2) / (w / 2)``, without cancellation at any width, in [-1, 1]."""
-    return wave.derivative(0.5 * lower + 0.5 * upper) * torch.sinc((upper - lower) * (1.0 / _TWO_PI))
+    sinc = functions_of(lower).sinc
+    return wave.derivative(0.5 * lower + 0.5 * upper) * sinc((upper - lower) * (1.0 / _TWO_PI))
 
 
 def _shortened(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """The interval; if an inflection is inside, its shorter side cut to half the longer one's length."""
+    m = functions_of(lower)
     middle = 0.5 * lower + 0.5 * upper
-    center = wave.inflection + math.pi * torch.round((middle - wave.inflection) * (1.0 / math.pi))
+    center = wave.inflection + math.pi * m.round((middle - wave.inflection) * (1.0 / math.pi))
     left, right = center - lower, upper - center
     return (
-        torch.where(left < right, torch.maximum(lower, center - 0.5 * right), lower),
-        torch.where(left < right, upper, torch.minimum(upper, center + 0.5 * left)),
+        m.where(left < right, m.maximum(lower, center - 0.5 * right), lower),
+        m.where(left < right, upper, m.minimum(upper, center + 0.5 * left)),
     )
 
 
@@ -177,18 +219,19 @@ def _extrema(wave: _Wave, slope: Tensor, ends: Tensor, values: Tensor) -> tuple[
     and its height are taken as constants by autograd: the derivative of an extreme value with respect to the slope is
     minus its place.
     """
-    with torch.no_grad():
-        base = torch.stack(wave.turns(slope))
-        height = torch.sqrt((1.0 - slope) * (1.0 + slope))
+    m = functions_of(slope)
+    with torch.no_grad() if m is torch else contextlib.nullcontext():
+        base = m.stack(wave.turns(slope))
+        height = m.sqrt((1.0 - slope) * (1.0 + slope))
         turns = (ends[:, None] - base) * (1.0 / _TWO_PI)
-        first, last = torch.ceil(turns[0] - _SLACK), torch.floor(turns[1] + _SLACK)
+        first, last = m.ceil(turns[0] - _SLACK), m.floor(turns[1] + _SLACK)
         outside = first > last
-        points = base + _TWO_PI * torch.stack([first, last])
+        points = base + _TWO_PI * m.stack([first, last])
     tilted = slope * points
     at_ends = values - slope * ends
-    tops = torch.where(outside[0], -math.inf, height - tilted[:, 0])
-    bottoms = torch.where(outside[1], math.inf, -height - tilted[:, 1])
-    return torch.cat([at_ends, tops]), torch.cat([at_ends, bottoms]), points
+    tops = m.where(outside[0], -math.inf, height - tilted[:, 0])
+    bottoms = m.where(outside[1], math.inf, -height - tilted[:, 1])
+    return m.cat([at_ends, tops]), m.cat([at_ends, bottoms]), points
 
 
 @torch.no_grad()

@@ -21,6 +21,7 @@ from sagemp_cli.reachability.relaxations import (
     tangent,
     tanh,
 )
+from sagemp_cli.reachability.relaxations.functions import functions_of
 
 from .relaxation_cases import flint_precision
 
@@ -65,7 +66,22 @@ def _softplus(x: arb) -> arb:
     return x + (-x).exp().log1p() if x > 0 else x.exp().log1p()
 
 
+def _of_arrays(name: str):
+    """What a relaxation uses where it gets arrays."""
+    return lambda x: torch.as_tensor(getattr(functions_of(x.numpy()), name)(x.numpy()))
+
+
 FORMULAS = {
+    **{
+        f"{name} of arrays": (_of_arrays(name), exact, (1e-300, largest, True), sine.ULPS, True)
+        for name, exact, largest in (
+            ("sin", lambda x: x.sin(), 1e13),
+            ("cos", lambda x: x.cos(), 1e13),
+            ("acos", lambda x: x.acos(), 1.0),
+            ("asin", lambda x: x.asin(), 1.0),
+            ("sinc", lambda x: x.sinc_pi(), 100.0),
+        )
+    },
     "sin": (torch.sin, lambda x: x.sin(), (1e-300, 1e13, True), sine.ULPS, True),
     "cos": (torch.cos, lambda x: x.cos(), (1e-300, 1e13, True), sine.ULPS, True),
     "acos": (torch.acos, lambda x: x.acos(), (1e-300, 1.0, True), sine.ULPS, True),

@@ -1,0 +1,50 @@
+"""The functions of numpy under the names that torch has for them.
+
+A relaxation that is written with ``functions_of(x)`` works on tensors, differentiably, and on arrays, whose operations
+on a few numbers take a fifth of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def functions_of(x: Any) -> Any:
+    """Torch for a tensor, else numpy by torch's names."""
+    return torch if isinstance(x, Tensor) else _Numpy
+
+
+def on_tensors(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function of tensors makes of tensors, or of arrays; it may give a named tuple."""
+    if isinstance(arguments[0], Tensor):
+        return function(*arguments)
+    answer = function(*(torch.from_numpy(a) for a in arguments))
+    return answer.numpy() if isinstance(answer, Tensor) else type(answer)(*(part.numpy() for part in answer))
+
+
+class _Numpy:
+    where, maximum, minimum = np.where, np.maximum, np.minimum
+    sin, cos, acos, asin, sqrt = np.sin, np.cos, np.arccos, np.arcsin, np.sqrt
+    ceil, floor, round, isfinite, cat = np.ceil, np.floor, np.rint, np.isfinite, np.concatenate
+    zeros_like, ones_like, full_like = np.zeros_like, np.ones_like, np.full_like
+    amax, amin, any, all = np.maximum.reduce, np.minimum.reduce, np.any, np.all
+
+    @staticmethod
+    def clamp(x: np.ndarray, min: float | None = None, max: float | None = None) -> np.ndarray:  # noqa: A002
+        x = x if min is None else np.maximum(x, min)
+        return x if max is None else np.minimum(x, max)
+
+    @staticmethod
+    def stack(arrays: Any) -> np.ndarray:
+        return np.array(arrays)
+
+    @staticmethod
+    def sinc(x: np.ndarray) -> np.ndarray:
+        y = math.pi * np.where(x == 0, 1e-20, x)
+        return np.sin(y) / y
