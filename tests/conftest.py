@@ -24,7 +24,8 @@ def toy_root(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("artifacts")
     config = compose(["effort=toy", f"artifacts={root}"])
     for stage in STAGES:
-        stage.run(StageContext.of(config))
+        if stage.applies(config):
+            stage.run(StageContext.of(config))
     return root
 
 
@@ -73,3 +74,47 @@ def example() -> Callable[..., Any]:
         return example_of(record, np.random.default_rng(seed), SIZES | sizes)
 
     return make
+
+
+LEARNED_UNICYCLE = {
+    "_target_": "sagemp_cli.dynamics.learned.Learned",
+    "hidden": [4, 4],
+    "activation": "tanh",
+    "inputs": ["theta", "v"],
+    "model": {
+        "_target_": "sagemp_cli.dynamics.unicycle.Unicycle",
+        "dt": 0.1,
+        "control_lower": [-9.0, -9.0],
+        "control_upper": [9.0, 9.0],
+        "state_lower": [-9.0, -9.0, -9.0, -9.0],
+        "state_upper": [9.0, 9.0, 9.0, 9.0],
+    },
+}
+"""Section of a robot whose weights :func:`learned_unicycle` makes by hand."""
+
+
+def learned_unicycle_of(section: Any = LEARNED_UNICYCLE, *, scale: float = 0.1, drift: float = 0.0) -> Any:
+    """A network that is nearly ``px' = v + drift, py' = theta, theta' = u_1, v' = u_2``, and not quite: hidden values
+    are ``tanh(scale z) ~ scale z``. Near heading 0 and speed 1 it is a fair model of a unicycle, up to the drift.
+    """
+    import torch
+
+    from sagemp_cli.binding import build
+
+    robot = build(section, "dynamics")
+    first, second, last = robot.layers
+    with torch.no_grad():
+        for layer in robot.layers:
+            layer.weight.zero_()
+            layer.bias.zero_()
+        first.weight[range(4), range(2, 6)] = scale
+        second.weight.copy_(torch.eye(4))
+        last.weight[[0, 1, 2, 3], [1, 0, 2, 3]] = 1.0 / scale
+        last.bias[0] = drift
+    return robot
+
+
+@pytest.fixture
+def learned_unicycle() -> Callable[..., Any]:
+    """:func:`learned_unicycle_of`."""
+    return learned_unicycle_of

@@ -19,6 +19,7 @@ RANK = {
     "reachability": 5,
     "planners": 5,
     "experts": 5,
+    "identification": 5,
     "trackers": 5,
     "closed_loop": 4,
     "training": 4,

@@ -9,7 +9,7 @@ import numpy as np
 
 from sagemp_cli.checker.balls import BITS, Unproved, arb, arb_mat, ball, balls, ctx
 from sagemp_cli.checker.form import Entry, Form, Step
-from sagemp_cli.checker.functions import leaky_relu
+from sagemp_cli.checker.functions import FUNCTIONS, leaky_relu
 from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UnsupportedOperationError
@@ -46,6 +46,8 @@ class CellClaim:
         operations: name and number of entries, in the order of evaluation.
         slope, offset, radius: ``(K, E)``.
         kept: ``(K, bytes)`` or None.
+        deviation: of the analytical model that a learned robot stands for, ``(K, n)``: the claim is then about that
+            model; None for a claim about the robot itself.
         begin, end: steps at which the cell's set begins and ends.
         heir_lower, heir_upper: the cell that encloses it from there on; None if it ends at K.
     """
@@ -64,6 +66,7 @@ class CellClaim:
     offset: np.ndarray
     radius: np.ndarray
     kept: np.ndarray | None
+    deviation: np.ndarray | None
     begin: int
     end: int
     heir_lower: np.ndarray | None = None
@@ -72,7 +75,8 @@ class CellClaim:
 
 def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
     """Prove that every real-arithmetic rollout that is in the cell at the first step stays in the stored tube up to the
-    last, under every disturbance in W^K and with every control within its stored bounds, and is in its heir then.
+    last, under every disturbance in W^K and with every control within its stored bounds, and is in its heir then. The
+    rollouts are those of the robot, or where a deviation is claimed those of its analytical model.
 
     The answer is empty, or says in one line what could not be proved.
     """
@@ -89,7 +93,7 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
                 x = step.state()
                 u = loop.control(step, k, x)
                 _require_inside(step.bounds(u.rows()), claim.control_lower[k], claim.control_upper[k], "control")
-                after = dynamics.step(x, u, step.disturbance)
+                after = _after(claim, dynamics, step, k, x, u)
                 step.finish()
                 states = states.image(after.rows())
                 if claim.kept is not None:
@@ -100,6 +104,19 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
         except (Unproved, UnsupportedOperationError) as e:
             return f"step {k}: {e}"
     return ""
+
+
+def _after(claim: CellClaim, dynamics: Dynamics, step: Step, k: int, x: Form, u: Form) -> Form:
+    """The next state: of the robot, or of its analytical model by way of the learned one.
+
+    ``analytical.step(x, u, w) = learned.step(x, u, w + e)``, and of the deviation e only an enclosure is kept.
+    """
+    if claim.deviation is None:
+        return dynamics.step(x, u, step.disturbance)
+    derivative, deviation = dynamics.compared(x, u)
+    _require_inside(step.bounds(deviation.rows()), -claim.deviation[k], claim.deviation[k], "deviation in state")
+    folded = step.apply("identity", FUNCTIONS["identity"], deviation)
+    return dynamics.advance(x, derivative, step.disturbance + folded)
 
 
 class Loop:

@@ -59,6 +59,7 @@ class Report:
         answer: VERIFIED if all references are proved, FALSIFIED if a violation is, else UNKNOWN.
         problems: what is wrong with the claim as a whole, one line each.
         findings: one for each reference.
+        true_model: of a learned robot, the same about its analytical model; None if the file says nothing of that.
         cells, horizon: how many.
         seconds, proof_seconds: time of this check, and of the proof according to the file.
     """
@@ -69,6 +70,7 @@ class Report:
     answer: str
     problems: tuple[str, ...]
     findings: tuple[Finding, ...]
+    true_model: tuple[Finding, ...] | None
     cells: int
     horizon: int
     seconds: float
@@ -77,6 +79,9 @@ class Report:
 
 def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -> Report:
     """Prove what a file claims.
+
+    The claim about a learned robot's analytical model is a second one of its own. If any part of it does not hold, that
+    is a problem of the whole file, however well the first is proved.
 
     Args:
         path: a certificate or a library.
@@ -89,7 +94,7 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
     began = time.perf_counter()
     document = read_document(path)
     try:
-        dynamics = _dynamics(document.config)
+        dynamics = _dynamics(document.config, document.robot)
         safe = SafeSet.of(document.config["scene"])
         with ctx.workprec(BITS):
             problems = list(_problems(document, dynamics, safe))
@@ -97,15 +102,18 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
         raise ArtifactError(f"{path}: /config does not describe a problem ({' '.join(str(e).split())})") from None
     except Unproved as e:
         raise ArtifactError(f"{path}: /config: {e}") from None
-    tubes, count = document.tubes, len(document.tubes["references"])
+    tubes, true = document.tubes, None
+    work = processes, progress or Silent()
     with ctx.workprec(BITS):
-        claims = [] if problems else [r for r in range(count) if tubes["verdict"][r] == "SAFE"]
-        reasons, findings = _geometry(document, dynamics, safe, claims)
-        open_ = [r for r in claims if not reasons[r]]
-        for r, reason in _reach_sets(document, dynamics, open_, processes, progress or Silent()):
-            reasons[r] = reasons[r] or reason
-        found = tuple(_finding(r, tubes["verdict"][r], reasons.get(r), findings.get(r)) for r in range(count))
+        found = _findings(document, dynamics, safe, *work, sound=not problems)
         falsified = not problems and document.verdict == "FALSIFIED" and _falsified(document, dynamics, safe)
+        if document.true_model is not None:
+            true = _findings(document.true_model, dynamics, safe, *work, sound=not problems)
+            problems += [
+                f"the analytical model, reference {f.reference}: {f.reason}"
+                for f in true
+                if f.claimed == "SAFE" and not f.proved
+            ]
     verified = bool(found) and not problems and all(f.proved for f in found)
     return Report(
         path=path,
@@ -114,6 +122,7 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
         answer="VERIFIED" if verified else "FALSIFIED" if falsified else "UNKNOWN",
         problems=tuple(problems),
         findings=found,
+        true_model=true,
         cells=len(tubes["cell_reference"]),
         horizon=tubes["references"].shape[1] - 1,
         seconds=time.perf_counter() - began,
@@ -121,16 +130,52 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
     )
 
 
-def _dynamics(config: Mapping[str, Any]) -> Dynamics:
+def _findings(
+    document: Document, dynamics: Dynamics, safe: SafeSet, processes: int, progress: Progress, *, sound: bool
+) -> tuple[Finding, ...]:
+    """What is found about every reference; nothing is proved unless the file as a whole is sound."""
+    tubes, count = document.tubes, len(document.tubes["references"])
+    claims = [r for r in range(count) if tubes["verdict"][r] == "SAFE"] if sound else []
+    reasons, margins = _geometry(document, dynamics, safe, claims)
+    open_ = [r for r in claims if not reasons[r]]
+    for r, reason in _reach_sets(document, dynamics, open_, processes, progress):
+        reasons[r] = reasons[r] or reason
+    return tuple(_finding(r, tubes["verdict"][r], reasons.get(r), margins.get(r)) for r in range(count))
+
+
+def _dynamics(config: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Dynamics:
+    """The robot; a learned one with the weights that the file holds."""
     section = config["dynamics"]
     model = target_class(section, "dynamics")  # from an allow-list of this package's own classes
     if not issubclass(model, Dynamics):
         raise TypeError(f"dynamics: {model.__name__} is not a robot model")
-    return model(**{key: value for key, value in section.items() if key != "_target_"}).double().eval()
+    robot = model(**{key: value for key, value in section.items() if key != "_target_"}).double().eval()
+    wanted = robot.state_dict()
+    if weights.keys() != wanted.keys():
+        odd = min(weights.keys() ^ wanted.keys())
+        raise ValueError(f"dynamics: weight '{odd}' is {'not understood' if odd in weights else 'missing'}")
+    for name, value in weights.items():
+        if value.shape != tuple(wanted[name].shape) or value.dtype != np.float64 or not np.isfinite(value).all():
+            raise ValueError(f"dynamics: weight '{name}' must be finite float64 of shape {tuple(wanted[name].shape)}")
+    robot.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    return robot
 
 
 def _problems(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator[str]:
     """What is wrong with the claim as a whole: sizes, W, X_I, finite numbers, and the verdict of all."""
+    yield from _problems_of_tubes(document, dynamics, safe)
+    follows = _answer(document.tubes["verdict"])
+    if document.kind == "certificate" and document.verdict != follows:
+        yield f"the verdict is {document.verdict}, but {follows} follows from those of the references"
+    true = document.true_model
+    if true is not None:
+        yield from (f"the analytical model: {problem}" for problem in _problems_of_tubes(true, dynamics, safe))
+        if not np.array_equal(true.tubes["references"], document.tubes["references"]):
+            yield "the analytical model: its references are others than the robot's"
+
+
+def _problems_of_tubes(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator[str]:
+    """The same of one claim, without the verdict of all."""
     tubes, config, n = document.tubes, document.config, dynamics.state_dim
     sizes = (tubes["references"].shape[2], tubes["control_lower"].shape[2], tubes["references"].shape[1] - 1)
     wanted = (n, dynamics.control_dim, config["horizon"])
@@ -160,9 +205,6 @@ def _problems(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator
         yield str(e)
     if tuple(tubes["constraint_names"]) != safe.names:
         yield f"the constraints are {', '.join(safe.names)}, the file names {', '.join(tubes['constraint_names'])}"
-    follows = _answer(tubes["verdict"])
-    if document.kind == "certificate" and document.verdict != follows:
-        yield f"the verdict is {document.verdict}, but {follows} follows from those of the references"
     if not document.operations and "SAFE" in tubes["verdict"]:
         yield (
             f"the tubes were made by propagator '{document.propagator}', which records no relaxations: "
@@ -247,7 +289,7 @@ def _reach_sets(
     """Reference and reason, empty if proved, for each of their cells."""
     owner = document.tubes["cell_reference"]
     cells = np.flatnonzero(np.isin(owner, claims)).tolist()
-    jobs = ((_claim(document, c), document.config["dynamics"], document.policy) for c in cells)
+    jobs = ((_claim(document, c), (document.config["dynamics"], document.robot), document.policy) for c in cells)
     with progress.task("checking cells", len(cells)) as task:
         if processes <= 1 or len(cells) < 2:
             answers = (prove_cell(claim, dynamics, policy) for claim, _, policy in jobs)
@@ -262,9 +304,12 @@ def _reach_sets(
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
 
 
-def _prove_elsewhere(claim: CellClaim, section: Mapping[str, Any], policy: Policy) -> str:
+def _prove_elsewhere(
+    claim: CellClaim, robot: tuple[Mapping[str, Any], Mapping[str, np.ndarray]], policy: Policy
+) -> str:
     torch.set_num_threads(1)
-    return prove_cell(claim, _dynamics({"dynamics": section}), policy)
+    section, weights = robot
+    return prove_cell(claim, _dynamics({"dynamics": section}, weights), policy)
 
 
 def _claim(document: Document, c: int) -> CellClaim:
@@ -285,6 +330,7 @@ def _claim(document: Document, c: int) -> CellClaim:
         offset=found["offset"][c],
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
+        deviation=None if document.deviation is None else document.deviation[r],
         begin=int(tubes["cell_begin"][c]),
         end=int(tubes["cell_end"][c]),
         heir_lower=None if heir < 0 else tubes["cell_lower"][heir],

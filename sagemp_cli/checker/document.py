@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,8 +35,11 @@ class Document:
         operations: names and numbers of entries of the recorded relaxations; empty if none are recorded.
         relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``.
         policy: the tracker.
+        robot: weights of a learned robot by name; empty for one of formulas.
         verdict: of a certificate; empty for a library.
         counterexamples: attributes and datasets of each.
+        deviation: of a learned robot from its analytical model, ``(R, K, n)``, if the claim is about that model.
+        true_model: a learned robot's claim about its analytical model; the same file, other tubes.
     """
 
     kind: str
@@ -46,8 +50,11 @@ class Document:
     operations: tuple[tuple[str, int], ...]
     relaxations: Mapping[str, np.ndarray]
     policy: Policy
+    robot: Mapping[str, np.ndarray]
     verdict: str
     counterexamples: tuple[Mapping[str, Any], ...]
+    deviation: np.ndarray | None = None
+    true_model: Document | None = None
 
 
 def read_document(path: Path) -> Document:
@@ -96,7 +103,32 @@ def _read(file: h5py.File, path: Path) -> Document:
     if content_hash(file) != stored:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
     config = yaml.load(file["config"].asstr()[()], Loader=_PLAIN_YAML)
-    data, tubes = file["data"], file["data/tubes"]
+    data = file["data"]
+    weights = {name: _dataset(d) for name, d in data["tracker"].items()}
+    examples = data.get("counterexamples", {})
+    document = Document(
+        kind=schema.removeprefix("sagemp/"),
+        config=config,
+        **_tubes(data["tubes"], path),
+        policy=_policy(weights, json.loads(data.attrs["tracker_arguments"])),
+        robot={name: _dataset(d) for name, d in data.get("dynamics", {}).items()},
+        verdict=str(data.attrs.get("verdict", "")),
+        counterexamples=tuple(
+            {**examples[name].attrs, **{key: _dataset(d) for key, d in examples[name].items()}} for name in examples
+        ),
+    )
+    if "true_model" not in data:
+        return document
+    true = dataclasses.replace(document, **_tubes(data["true_model/tubes"], path))
+    deviation, shape = _dataset(data["true_model/deviation"]), true.tubes["references"].shape
+    wanted = (shape[0], shape[1] - 1, shape[2])
+    if not document.robot or deviation.shape != wanted or deviation.dtype != np.float64:
+        raise ArtifactError(f"{path}: /data/true_model needs a learned robot and a float64 deviation of shape {wanted}")
+    return dataclasses.replace(document, true_model=dataclasses.replace(true, deviation=deviation))
+
+
+def _tubes(tubes: h5py.Group, path: Path) -> dict[str, Any]:
+    """What a group of tubes holds, as fields of a :class:`Document`."""
     read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], h5py.Dataset)}
     _require_shapes(read, path)
     relaxations, operations = {}, ()
@@ -105,22 +137,13 @@ def _read(file: h5py.File, path: Path) -> Document:
         relaxations = {name: _dataset(group[name]) for name in group}
         operations = tuple(zip(relaxations["operations"], map(int, relaxations["widths"]), strict=True))
         _require_relaxations(relaxations, operations, read, path)
-    weights = {name: _dataset(d) for name, d in data["tracker"].items()}
-    examples = data.get("counterexamples", {})
-    return Document(
-        kind=schema.removeprefix("sagemp/"),
-        config=config,
-        tubes=read,
-        propagator=str(tubes.attrs["propagator"]),
-        rigorous=bool(tubes.attrs["rigorous"]),
-        operations=operations,
-        relaxations=relaxations,
-        policy=_policy(weights, json.loads(data.attrs["tracker_arguments"])),
-        verdict=str(data.attrs.get("verdict", "")),
-        counterexamples=tuple(
-            {**examples[name].attrs, **{key: _dataset(d) for key, d in examples[name].items()}} for name in examples
-        ),
-    )
+    return {
+        "tubes": read,
+        "propagator": str(tubes.attrs["propagator"]),
+        "rigorous": bool(tubes.attrs["rigorous"]),
+        "operations": operations,
+        "relaxations": relaxations,
+    }
 
 
 def _dataset(dataset: h5py.Dataset) -> Any:

@@ -162,6 +162,7 @@ FUNCTIONS: dict[str, Function] = {
     "log": _smooth(arb.log, lambda x: 1 / x, lambda x: -1 / x**2),
     "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt())),
     "reciprocal": _smooth(lambda x: 1 / x, lambda x: -1 / x**2, lambda x: 2 / x**3),
+    "identity": Function(((None, _line(1.0), None),)),
     "abs": Function(((None, _line(-1.0), 0.0), (0.0, _line(1.0), None))),
     "relu": Function(((None, _line(0.0), 0.0), (0.0, _line(1.0), None))),
 }

@@ -74,12 +74,21 @@ class Dynamics(nn.Module):
         """Number of controls m."""
         return len(self.control_names)
 
+    @property
+    def analytical(self) -> Dynamics:
+        """The model of formulas that this one stands for: itself, unless it was learned from another."""
+        return self
+
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative ``f(x, u)``; ``x (..., n)``, ``u (..., m)`` to ``(..., n)``."""
         raise NotImplementedError
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """One forward-Euler step under the disturbance ``w (..., n)``; see the class for how w enters."""
+        return self.advance(x, self.derivative(x, u), w)
+
+    def advance(self, x: Tensor, derivative: Tensor, w: Tensor) -> Tensor:
+        """The same from a derivative that is known already."""
         if self.disturbance == "derivative":
-            return x + self.dt * (self.derivative(x, u) + w)
-        return x + self.dt * self.derivative(x, u) + w
+            return x + self.dt * (derivative + w)
+        return x + self.dt * derivative + w

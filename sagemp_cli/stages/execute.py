@@ -9,7 +9,7 @@ from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.rollouts import draw_rollouts
 from sagemp_cli.stages.options import whole_number
-from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.tubes import verification_of
 from sagemp_cli.storage import Rollouts
@@ -17,7 +17,7 @@ from sagemp_cli.storage import Rollouts
 
 def run(context: StageContext) -> Path:
     """Measure starts in X_I, ask the planner, track the closest certified reference, and watch the tube."""
-    problem, section = problem_of(context.config), context.config["execute"]
+    (problem, robot_files), section = trained_problem(context), context.config["execute"]
     queries = whole_number(section["queries"], "execute.queries")
     rollouts = whole_number(section["rollouts"], "execute.rollouts")
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
@@ -48,6 +48,6 @@ def run(context: StageContext) -> Path:
         in_tube=done.in_tube.numpy(),
         safe=done.safe.numpy(),
     )
-    path = context.write("execute", record, (planner_file, tracker_file, library_file))
+    path = context.write("execute", record, (planner_file, tracker_file, library_file, *robot_files))
     draw_beside(path, draw_rollouts, context.read("execute"), library_file)
     return path

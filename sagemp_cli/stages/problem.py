@@ -8,9 +8,13 @@ from typing import Any
 
 from sagemp_cli.binding import build
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.models import robot_from
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.storage import Artifact, DynamicsModel
 
 
 @dataclass(frozen=True)
@@ -32,14 +36,29 @@ class Problem:
     horizon: int
 
 
+def trained_problem(context: StageContext) -> tuple[Problem, tuple[Artifact[DynamicsModel], ...]]:
+    """The problem of a stage's config, a learned robot with its weights, and the files that these came from.
+
+    Raises:
+        ConfigError: see :func:`problem_of`.
+        ArtifactError: a learned robot's weights are missing or not its own.
+    """
+    problem = problem_of(context.config)
+    if not isinstance(problem.dynamics, Learned):
+        return problem, ()
+    artifact = context.read("train-dynamics")
+    robot_from(artifact, problem.dynamics)
+    return problem, (artifact,)
+
+
 def problem_of(config: Mapping[str, Any]) -> Problem:
-    """Build the problem; every complaint is one line that names the key.
+    """Build the problem; every complaint is one line that names the key. A learned robot has no weights yet.
 
     Raises:
         ConfigError: a key is missing or has the wrong length, a number is NaN or infinite, a radius is negative,
             or the start box has zero width in every dimension (one rollout would do there).
     """
-    dynamics = build(config["dynamics"], "dynamics")
+    dynamics = robot_of(config)
     names, n = dynamics.state_names, dynamics.state_dim
     scene = scene_from_mapping(config["scene"], state_dim=n, position_dim=len(dynamics.position))
     horizon = config["horizon"]
@@ -57,6 +76,11 @@ def problem_of(config: Mapping[str, Any]) -> Problem:
         disturbance=Box.around([0.0] * n, disturbance),
         horizon=horizon,
     )
+
+
+def robot_of(config: Mapping[str, Any]) -> Dynamics:
+    """The robot of a config; a learned one has no weights yet."""
+    return build(config["dynamics"], "dynamics")
 
 
 def _radius(where: str, values: Any, names: tuple[str, ...]) -> list[float]:

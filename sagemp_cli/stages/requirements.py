@@ -14,7 +14,8 @@ from sagemp_cli.reachability.partition import uncertain_dimensions
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.proof import partition_complaints
-from sagemp_cli.stages.stage import STAGES
+from sagemp_cli.stages.stage import STAGES, stage_named
+from sagemp_cli.stages.train_dynamics import training_complaints
 from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
@@ -23,9 +24,10 @@ _RUN = ("generator", "checkpoint", "identity", "progress")
 """Arguments of everything that trains or searches, which the stages give."""
 
 _KEYS = {
-    "verify": ("partitions", "budget", "memory", "references", "file", "falsifier"),
+    "verify": ("partitions", "budget", "memory", "references", "file", "falsifier", "true_model"),
     "library": ("size", "budget", "start_spread"),
     "execute": ("queries", "rollouts"),
+    "safety": ("references", "rollouts", "within_limits"),
     "start": ("center", "radius"),
     "disturbance": ("radius",),
 }
@@ -55,16 +57,10 @@ def _option_complaints(config: Mapping[str, Any]) -> Iterator[str]:
     yield from option_complaints(Expert, expert, "expert", given=("dynamics", "scene", "horizon", "weights"))
     yield from option_complaints(Weights, config["expert"].get("weights"), "expert.weights")
 
-    training = config["planner_training"]
-    given = ("planner", "demonstrations", "held_out", "scene", "position", *_RUN)
-    yield from option_complaints(train_planner, _without(training, "held_out"), "planner_training", given=given)
-    try:
-        loss = target_class(config["planner"], "planner").loss_type
-    except ConfigError:
-        pass  # the section's own complaint
-    else:
-        given = ("planner", "demonstrations", "steps")
-        yield from option_complaints(loss, training.get("loss"), "planner_training.loss", given=given)
+    yield from _planner_complaints(config)
+
+    if stage_named("train-dynamics").applies(config):
+        yield from training_complaints(config)
 
     training = config["training"]
     given = ("tracker", "dynamics", "references", "start", "disturbance", "tube", *_RUN)
@@ -81,6 +77,24 @@ def _option_complaints(config: Mapping[str, Any]) -> Iterator[str]:
             if key not in known:
                 near = did_you_mean(str(key), known) or f"; known: {', '.join(known)}"
                 yield f"{section}.{key}: no such option{near}"
+
+
+def _planner_complaints(config: Mapping[str, Any]) -> Iterator[str]:
+    """Options of what trains the planner; where nothing does, ``planner_training`` is not looked at."""
+    try:
+        planner, training = target_class(config["planner"], "planner"), config["planner_training"]
+    except ConfigError:
+        return  # the section's own complaint
+    learns_from = getattr(planner, "learns_from", None)
+    if learns_from == "demonstrations":
+        given = ("planner", "demonstrations", "held_out", "scene", "position", *_RUN)
+        yield from option_complaints(train_planner, _without(training, "held_out"), "planner_training", given=given)
+        given = ("planner", "demonstrations", "steps")
+        yield from option_complaints(planner.loss_type, training.get("loss"), "planner_training.loss", given=given)
+    elif learns_from == "scenes":
+        yield from option_complaints(planner.learn, training, "planner_training", given=("self", "scene", *_RUN))
+    elif learns_from != "nothing":
+        yield f"planner._target_: {planner.__name__} is no planner: it does not say what it learns from"
 
 
 def _source_complaints(sources: Any, own: str) -> Iterator[str]:

@@ -19,17 +19,20 @@ import torch
 
 from sagemp_cli.binding import target_class
 from sagemp_cli.config import compose
+from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.storage import (
     Artifact,
     Certificate,
     Demonstrations,
+    DynamicsModel,
     Header,
     Library,
     Parent,
     PlannerModel,
     Rollouts,
+    SafetyRates,
     TrackerModel,
     read_artifact,
     refuse_existing,
@@ -85,6 +88,11 @@ def _has_demonstrations(config: Mapping[str, Any]) -> bool:
     return getattr(target_class(config["planner"], "planner"), "learns_from", None) == "demonstrations"
 
 
+def _learns_its_robot(config: Mapping[str, Any]) -> bool:
+    """Whether the robot is a learned one."""
+    return target_class(config["dynamics"], "dynamics") is Learned
+
+
 _ROBOT = ("name", "dynamics", "scene", "horizon")
 # Memory decides which cells are propagated together, which changes the last bits of their tubes.
 _PARTITION = ("verify.partitions", "verify.budget", "verify.memory")
@@ -98,34 +106,49 @@ STAGES = (
         (*_ROBOT, "expert", "start", "seed"),
         applies=_has_demonstrations,
     ),
+    Stage(
+        "train-dynamics",
+        "dynamics.h5",
+        DynamicsModel,
+        (),
+        ("name", "dynamics", "dynamics_training", "seed"),
+        applies=_learns_its_robot,
+    ),
     Stage("train-planner", "planner.h5", PlannerModel, ("gen-data",), (*_ROBOT, "planner", "planner_training", "seed")),
     Stage(
         "train-tracker",
         "tracker.h5",
         TrackerModel,
-        ("train-planner",),
+        ("train-dynamics", "train-planner"),
         (*_ROBOT, "tracker", "training", "start", "disturbance", "seed"),
     ),
     Stage(
         "verify",
         "certificate.h5",
         Certificate,
-        ("train-planner", "train-tracker"),
+        ("train-dynamics", "train-planner", "train-tracker"),
         (*_ROBOT, "propagator", "verify", "start", "disturbance", "seed"),
     ),
     Stage(
         "build-library",
         "library.h5",
         Library,
-        ("train-planner", "train-tracker"),
+        ("train-dynamics", "train-planner", "train-tracker"),
         (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance", "seed"),
     ),
     Stage(
         "execute",
         "rollouts.h5",
         Rollouts,
-        ("train-planner", "train-tracker", "build-library"),
+        ("train-dynamics", "train-planner", "train-tracker", "build-library"),
         (*_ROBOT, "execute", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "safety-rates",
+        "safety.h5",
+        SafetyRates,
+        ("train-dynamics", "train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", *_PARTITION, "library.start_spread", "safety", "start", "disturbance", "seed"),
     ),
 )
 
@@ -137,6 +160,8 @@ def stage_named(name: str) -> Stage:
 
 def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "build-library", "execute")) -> list[Stage]:
     """The stages that an experiment's ``last`` ones need, in order, themselves included.
+
+    Those that are not among the default ``last`` ones are made only when they are asked for by name.
 
     Of a stage whose file another experiment makes, the inputs are that experiment's affair.
     """
@@ -152,10 +177,12 @@ def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "bui
 
 
 def section(config: Mapping[str, Any], dotted: str) -> Any:
-    """The value of a dotted key, None where it is absent."""
+    """The value of a dotted key, None where it is absent; without what only says where the work is done."""
     node: Any = config
     for part in dotted.split("."):
         node = node.get(part) if isinstance(node, Mapping) else None
+    if dotted == "expert" and isinstance(node, Mapping):
+        return {key: value for key, value in node.items() if key != "processes"}
     return node
 
 

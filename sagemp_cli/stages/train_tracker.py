@@ -14,7 +14,7 @@ from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.training import draw_training
 from sagemp_cli.stages.options import options_for, whole_number
 from sagemp_cli.stages.partial import PartialFile
-from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.storage import TrackerModel
 from sagemp_cli.trackers.losses import LossWeights
@@ -25,7 +25,7 @@ from sagemp_cli.trackers.tube_loss import TubeLoss
 
 def run(context: StageContext) -> Path:
     """Train on references of the planner, starts and disturbances of the sets that will be verified."""
-    problem, section = problem_of(context.config), dict(context.config["training"])
+    (problem, robot_files), section = trained_problem(context), dict(context.config["training"])
     count = whole_number(section.pop("references", None), "training.references")
     tube = section.pop("tube", None)
     if tube is not None:
@@ -45,7 +45,8 @@ def run(context: StageContext) -> Path:
     references = planner.sample(
         problem.start.sample(count, drawing), problem.scene.goal, scene=problem.scene, count=count, generator=drawing
     )
-    partial = PartialFile.of(context, "train-tracker", parents=(planner_file.as_parent("planner", context.folder),))
+    parents = tuple(f.as_parent(f.path.stem, context.folder) for f in (planner_file, *robot_files))
+    partial = PartialFile.of(context, "train-tracker", parents=parents)
     history = train_tracker(
         tracker,
         problem.dynamics,
@@ -67,7 +68,7 @@ def run(context: StageContext) -> Path:
         figure_names=tuple(figures),
         figures=np.array(list(figures.values())),
     )
-    path = context.write("train-tracker", record, (planner_file,))
+    path = context.write("train-tracker", record, (planner_file, *robot_files))
     partial.remove()
     draw_beside(path, draw_training, context.read("train-tracker"))
     return path

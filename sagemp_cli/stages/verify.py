@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.planners.trajectory_file import REFERENCES
 from sagemp_cli.reachability.falsifier import Counterexample as Found
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.reachability.verdict import answer_of
@@ -14,10 +15,11 @@ from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.stages.options import options_for, whole_number
 from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.problem import problem_of
+from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_file import REFERENCES, read_references
+from sagemp_cli.stages.reference_file import read_references
 from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.true_model import TrueModelProof
 from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Certificate, Counterexample, Parent, sha256_of
 
@@ -27,8 +29,9 @@ def run(context: StageContext) -> Path:
 
     Finished chunks of cells are kept until the certificate is written: an interrupted run goes on from there.
     """
-    problem, section = problem_of(context.config), context.config["verify"]
+    (problem, robot_files), section = trained_problem(context), context.config["verify"]
     proof = Proof.of(context.config, problem)
+    folded = TrueModelProof.of(section["true_model"], proof) if robot_files else None
     count = whole_number(section["references"], "verify.references")
     search = section.get("falsifier") or {}
     given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
@@ -53,7 +56,7 @@ def run(context: StageContext) -> Path:
         file = Path(section["file"])
         references = read_references(file, horizon=problem.horizon, state_names=problem.dynamics.state_names)
         files = (Parent(REFERENCES, os.path.relpath(file, context.folder), sha256_of(file)),)
-    parents = (*(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file)), *files)
+    parents = (*(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file, *robot_files)), *files)
     pieces = PartialResults.of(context, "verify", without=("verify.falsifier",), parents=parents)
     verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     refutation = attack(
@@ -72,8 +75,10 @@ def run(context: StageContext) -> Path:
         counterexamples=tuple(_counterexample(r, found) for r, found in refutation.counterexamples),
         falsifier_rollouts=refutation.rollouts,
         verdict=str(answer_of(refutation.verification.verdicts)),
+        dynamics=robot_files[0].record.weights if robot_files else None,
+        true_model=folded.verify(references, tracker, context.progress) if folded and verification.safe else None,
     )
-    path = context.write("verify", record, (planner_file, tracker_file), files)
+    path = context.write("verify", record, (planner_file, tracker_file, *robot_files), files)
     pieces.remove()
     draw_beside(path, draw_certificate, context.read("verify"))
     return path

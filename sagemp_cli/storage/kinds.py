@@ -1,7 +1,7 @@
 """The kinds of artifact: one record class each. ``docs/artifacts.md`` describes them in prose.
 
 Dimensions: ``count`` demonstrations or references, ``K`` steps, ``n`` states, ``m`` controls, ``cells`` of all
-partitions together, ``rollouts`` simulated runs. Arrays are time first after the count. Numbers are finite but
+partitions together, ``rollouts`` simulated runs, ``bins`` of a histogram. Arrays are time first after the count. Numbers are finite but
 where ``finite=False`` says otherwise: bounds that overflowed are infinite, figures that were not measured NaN.
 """
 
@@ -63,6 +63,20 @@ class TrackerModel:
     curve: TrainingCurve = group(TrainingCurve, "training curve")
     figure_names: tuple[str, ...] = texts("report", "model card: names of the figures")
     figures: np.ndarray = array("report", "model card: values, e.g. tracking error", finite=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsModel:
+    """A learned robot model (made by ``train-dynamics``); built from the config's ``dynamics`` section."""
+
+    weights: dict[str, np.ndarray] = weights("parameters, in the robot's units")
+    curve: TrainingCurve = group(TrainingCurve, "training and validation curve")
+    figure_names: tuple[str, ...] = texts("report", "model card: names of the figures")
+    figures: np.ndarray = array("report", "model card: values", finite=False)
+    error_rms: np.ndarray = array("n", "root mean square error of each state's derivative on unseen transitions")
+    error_max: np.ndarray = array("n", "largest error of each state's derivative on unseen transitions")
+    error_edges: np.ndarray = array("n bins+1", "edges of the bins of 'error_counts'")
+    error_counts: np.ndarray = array("n bins", "unseen transitions whose error lies in each bin", dtype="int64")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +148,16 @@ class Counterexample:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrueModel:
+    """What is proved of the analytical model that a learned one stands for (see ``docs/certificates.md``)."""
+
+    tubes: Tubes = group(Tubes, "references, cells, tubes and verdicts of the analytical model")
+    deviation: np.ndarray = array(
+        "count K n", "bound of the learned model's deviation at each step, which w is enlarged by", finite=False
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Certificate:
     """What ``verify`` proved, with everything that the proof speaks about."""
 
@@ -143,6 +167,10 @@ class Certificate:
     counterexamples: tuple[Counterexample, ...] = group(Counterexample, "replayed counterexamples", many=True)
     falsifier_rollouts: int = scalar("rollouts that the falsifier tried")
     verdict: str = scalar("VERIFIED, FALSIFIED or UNKNOWN for all references together")
+    dynamics: dict[str, np.ndarray] | None = weights("of a learned robot: its weights, exact", optional=True)
+    true_model: TrueModel | None = group(
+        TrueModel, "of a learned robot: what holds of its analytical model", optional=True
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,6 +186,7 @@ class Library:
     reason_counts: np.ndarray = array("reasons", "how often each occurred", dtype="int64")
     sampled: int = scalar("references sampled altogether")
     wanted: int = scalar("certified references asked for, C")
+    dynamics: dict[str, np.ndarray] | None = weights("of a learned robot: its weights, exact", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +204,44 @@ class Rollouts:
     safe: np.ndarray = array("rollouts", "whether it stayed in the safe set and reached the goal", dtype="bool")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Rollouts of references, executed in one way."""
+
+    clearance: np.ndarray = array(
+        "count kinds rollouts",
+        "smallest signed distance to obstacles and workspace over all steps",
+        units="m",
+        finite=False,
+    )
+    reached: np.ndarray = array("count kinds rollouts", "whether the state at step K was in the goal", dtype="bool")
+    nearest: np.ndarray = array(
+        "count kinds K+1 n", "states of the rollout of the least clearance among equals", finite=False
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyRates:
+    """How many references are safe open loop, under the tracker, and certified (made by ``safety-rates``)."""
+
+    references: np.ndarray = array("count K+1 n", "references sampled from the planner")
+    controls: np.ndarray = array("count K m", "controls recovered from each reference by the dynamics' inverse")
+    residual: np.ndarray = array(
+        "count n", "root mean square over the steps of the slope of each state that these controls do not make, per s"
+    )
+    disturbances: tuple[str, ...] = texts("kinds", "kinds of disturbances: none, random, worst case")
+    open_loop: Trials = group(Trials, "the controls played back")
+    closed_loop: Trials = group(Trials, "the references tracked")
+    verdict: tuple[str, ...] = texts("count", "of the proof over all of X_I: SAFE (certified) or why it is not")
+    step: np.ndarray = array("count", "step that decided the verdict (-1: none, SAFE)", dtype="int64")
+    constraint: tuple[str, ...] = texts("count", "obstacle, workspace or goal dimension that decided ('' if SAFE)")
+    tube_lower: np.ndarray = array("count K+1 n", "lower bounds of each reference's tube, all cells", finite=False)
+    tube_upper: np.ndarray = array("count K+1 n", "upper bounds of each reference's tube, all cells", finite=False)
+    seconds: np.ndarray = array("count", "share of the proof time", units="s")
+    propagator: str = scalar("propagator that made the tubes")
+    rigorous: bool = scalar("whether rounding is included in the tubes")
+
+
 @dataclass(frozen=True)
 class Kind:
     """Name and format version of a record class."""
@@ -186,11 +253,13 @@ class Kind:
 
 KINDS = (
     Kind("demonstrations", 1, Demonstrations),
+    Kind("dynamics", 1, DynamicsModel),
     Kind("planner", 1, PlannerModel),
     Kind("tracker", 1, TrackerModel),
     Kind("certificate", 1, Certificate),
     Kind("library", 1, Library),
     Kind("rollouts", 1, Rollouts),
+    Kind("safety", 1, SafetyRates),
 )
 
 

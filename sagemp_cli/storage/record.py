@@ -45,9 +45,9 @@ def texts(dims: str, doc: str, *, optional: bool = False) -> Any:
     return _declare("texts", doc, dims=tuple(dims.split()), optional=optional)
 
 
-def weights(doc: str) -> Any:
+def weights(doc: str, *, optional: bool = False) -> Any:
     """Declare a group of named numeric arrays of any shape (a ``state_dict``), one dataset per parameter."""
-    return _declare("weights", doc)
+    return _declare("weights", doc, optional=optional)
 
 
 def scalar(doc: str, *, units: str = "", optional: bool = False) -> Any:

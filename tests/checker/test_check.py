@@ -282,9 +282,15 @@ def merged(case, path, *, at=4, shrink=0.0, gap=0.0):
         return out
 
     recording = run.recording()
+    size = max(record.relaxations.kept.shape[-1], recording.kept.shape[-1])
+    before, after = (
+        np.pad(kept, [*[(0, 0)] * (kept.ndim - 1), (0, size - kept.shape[-1])])
+        for kept in (record.relaxations.kept, recording.kept.numpy())
+    )
     relaxations = dataclasses.replace(
         record.relaxations,
         **{n: with_heir(getattr(record.relaxations, n), getattr(recording, n).numpy()) for n in BANDS},
+        kept=with_heir(before, after),
     )
     lower, upper = (joined(v, v[0]) for v in (record.tube_lower, record.tube_upper))
     lower[2, at:], upper[2, at:] = run.tube.lower.numpy(), run.tube.upper.numpy()

@@ -104,8 +104,8 @@ def put(name: str, index, value) -> Change:
     return change
 
 
-ENTRIES = [*range(8), 8, 10]
-"""Entries of the record that are not products: two layers of four, cosine, sine; 9 and 11 are products."""
+ENTRIES = [*range(8), 8, 9]
+"""Entries of the record that are not products: two layers of four, cosine, sine; 10 and 11 are products."""
 
 
 def tube(rng, truth) -> Iterator[Change]:
@@ -134,7 +134,7 @@ def relaxation(rng, truth) -> Iterator[Change]:
 def product(rng, truth) -> Iterator[Change]:
     record = truth.tubes.relaxations
     while True:
-        c, k, e = int(rng.integers(2)), int(rng.integers(8)), int(rng.choice([9, 11]))
+        c, k, e = int(rng.integers(2)), int(rng.integers(8)), int(rng.choice([10, 11]))
         radius = float(record.radius[c, k, e])
         if radius < CLEARLY:
             continue

@@ -46,7 +46,7 @@ def made_up(monkeypatch, example):
 
     def fake(stage):
         def run(context):
-            parents = tuple(context.read(name) for name in stage.inputs)
+            parents = tuple(context.read(name) for name in stage.inputs_in(context.config))
             state.ran.append(stage.name)
             state.seed += 1  # every run writes another file
             record = example(stage.record, seed=state.seed, count=1, cells=4)

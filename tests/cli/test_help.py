@@ -15,6 +15,7 @@ COMMANDS = [
     ["verify"],
     ["build-library"],
     ["execute"],
+    ["safety-rates"],
     ["run"],
     ["status"],
     ["inspect"],

@@ -8,9 +8,10 @@ from pathlib import Path
 import h5py
 import pytest
 
-from sagemp_cli.stages.stage import STAGES
+from sagemp_cli.config import compose
+from sagemp_cli.stages.stage import STAGES, stages_of
 
-NAMES = [stage.name for stage in STAGES]
+NAMES = [stage.name for stage in stages_of(compose([]))]
 FOLDER = Path("artifacts/unicycle_node")
 
 

@@ -8,7 +8,7 @@ from sagemp_cli.binding import build
 from sagemp_cli.config import compose, options_of
 from sagemp_cli.dynamics import Dynamics
 
-ROBOTS = options_of("dynamics")
+ROBOTS = [name for name in options_of("dynamics") if not name.endswith("_learned")]
 
 
 def robot(name: str, **changes) -> Dynamics:

@@ -62,13 +62,13 @@ def test_wrong_references_are_one_line_with_the_file(tmp_path, plans, name, chan
 @pytest.mark.parametrize("name", ["plans.h5", "plans.npz"])
 def test_files_that_are_none_are_one_line_too(tmp_path, plans, name):
     path = tmp_path / name
-    with pytest.raises(ArtifactError, match=r"no such file \(verify.file\)"):
+    with pytest.raises(ArtifactError, match="no such file"):
         read(path)
     path.write_bytes(b"PK\x03\x04 neither")
     with pytest.raises(ArtifactError, match="cannot be read"):
         read(path)
     path.unlink()
-    with pytest.raises(ArtifactError, match="has no (dataset|array) 'references'; found: trajectories"):
+    with pytest.raises(ArtifactError, match="has no dataset 'references'; found: trajectories"):
         read(save(path, plans, "trajectories"))
     with pytest.raises(ArtifactError, match=r"must be HDF5 \(.h5, .hdf5\) or NPZ \(.npz\)"):
         read(tmp_path / "plans.csv")

@@ -1,0 +1,77 @@
+"""``sagemp train-dynamics``: a learned robot's network, on transitions of its analytical model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagemp_cli.binding import option_complaints
+from sagemp_cli.dynamics.learned import Learned
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.identification import EnclosureWeight, learn_dynamics
+from sagemp_cli.models import curve_of, figures_at_end, weights_of
+from sagemp_cli.report.dynamics import draw_dynamics
+from sagemp_cli.report.figure import draw_beside
+from sagemp_cli.stages.options import options_for
+from sagemp_cli.stages.partial import PartialFile
+from sagemp_cli.stages.problem import robot_of
+from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.storage import DynamicsModel
+
+_GIVEN = ("robot", "generator", "checkpoint", "identity", "progress")
+
+
+def run(context: StageContext) -> Path:
+    """Draw transitions of the analytical model and learn from them; no other file is read.
+
+    Raises:
+        ConfigError: the config's robot is not a learned one, or an option is not one.
+    """
+    robot = robot_of(context.config)
+    if not isinstance(robot, Learned):
+        raise ConfigError(
+            f"dynamics: {type(robot).__name__} has nothing to learn; "
+            f"choose a learned robot, e.g. dynamics=unicycle_learned"
+        )
+    section = dict(context.config["dynamics_training"])
+    enclosure = section.pop("enclosure", None)
+    options = options_for(learn_dynamics, section, "dynamics_training", given=(*_GIVEN, "enclosure"))
+    if enclosure is not None:
+        enclosure = EnclosureWeight(**options_for(EnclosureWeight, enclosure, "dynamics_training.enclosure"))
+    partial = PartialFile.of(context, "train-dynamics")
+    history, errors = learn_dynamics(
+        robot,
+        generator=context.generator("train-dynamics"),
+        enclosure=enclosure,
+        checkpoint=partial.path,
+        identity=partial.identity,
+        progress=context.progress,
+        **options,
+    )
+    figures = figures_at_end(history) | {"parameters": float(sum(p.numel() for p in robot.parameters()))}
+    record = DynamicsModel(
+        weights=weights_of(robot),
+        curve=curve_of(history),
+        figure_names=tuple(figures),
+        figures=np.array(list(figures.values())),
+        error_rms=errors.rms,
+        error_max=errors.largest,
+        error_edges=errors.edges,
+        error_counts=errors.counts,
+    )
+    path = context.write("train-dynamics", record)
+    partial.remove()
+    draw_beside(path, draw_dynamics, context.read("train-dynamics"))
+    return path
+
+
+def training_complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``dynamics_training`` of a learned robot."""
+    section = config.get("dynamics_training")
+    plain = {k: v for k, v in section.items() if k != "enclosure"} if isinstance(section, Mapping) else section
+    found = option_complaints(learn_dynamics, plain, "dynamics_training", given=(*_GIVEN, "enclosure"))
+    enclosure = section.get("enclosure") if isinstance(section, Mapping) else None
+    return found + option_complaints(EnclosureWeight, enclosure, "dynamics_training.enclosure")
