@@ -17,7 +17,13 @@ OPTIONS = [(group, option) for group in groups() for option in options_of(group)
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=lambda v: v)
 def test_every_option_of_every_group_composes_and_fits_what_it_configures(group, option):
     # start, scene and disturbance belong to an experiment's robot, not to every robot there is
-    require_sound_config(compose([f"{group}={option}"]), problem=group != "dynamics")
+    require_sound_config(compose([f"{group}={option}"]), problem=group not in ("dynamics", "toy"))
+
+
+@pytest.mark.parametrize("effort", options_of("effort"))
+@pytest.mark.parametrize("experiment", options_of("experiment"))
+def test_every_experiment_is_sound_at_every_effort(experiment, effort):
+    require_sound_config(compose([f"experiment={experiment}", f"effort={effort}"]))
 
 
 def test_there_are_options_for_every_part_of_the_pipeline():
