@@ -3,9 +3,10 @@
     python benchmarks/campaign.py [--rollouts 10000000] [--artifacts artifacts] [--processes 2]
 
 Takes every ``certificate.h5`` and ``library.h5`` below the artifacts folder (run the experiments first), shares the
-rollouts out among the references, and compares each with the hull of its cells' tubes, in worker processes with one
-thread each. Writes ``<artifacts>/benchmarks/campaign.json``, adding to what is there: a campaign can be interrupted
-and gone on with, and each round draws new rollouts. Ends with exit code 1 if a single rollout ever left its tube.
+rollouts out among the references (of a learned robot, also among those of its analytical model), and compares each
+with the hull of its cells' tubes, in worker processes with one thread each. Writes
+``<artifacts>/benchmarks/campaign.json``, adding to what is there: a campaign can be interrupted and gone on with, and each round draws new rollouts. Ends with
+exit code 1 if a single rollout ever left its tube.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from sagemp_cli.closed_loop import ClosedLoop
@@ -31,21 +33,35 @@ from sagemp_cli.trackers import Tracker
 BATCH = 50_000
 
 
-def attack(path: Path, index: int, count: int, seed: int) -> dict:
-    """Attack one reference of one file with ``count`` rollouts."""
+def attack(path: Path, index: int, analytical: bool, count: int, seed: int) -> dict:
+    """Attack one reference of one file with ``count`` rollouts.
+
+    Args:
+        path: a certificate or a library.
+        index: of the reference.
+        analytical: of a learned robot, whether to attack what is claimed of its analytical model.
+        count: rollouts.
+        seed: of their random numbers.
+    """
     torch.set_num_threads(1)
     kind, _ = open_header(path)
     artifact = read_artifact(path, Certificate if kind.name == "certificate" else Library)
     tubes, problem = artifact.record.tubes, problem_of(artifact.header.config)
+    robot = problem.dynamics
+    if artifact.record.dynamics is not None:
+        robot.load_state_dict({k: torch.as_tensor(v) for k, v in artifact.record.dynamics.items()})
+        robot.requires_grad_(False)
+    if analytical:
+        tubes, robot = artifact.record.true_model.tubes, robot.analytical
     tracker = Tracker(**json.loads(artifact.record.tracker_arguments))
     tracker.load_state_dict({k: torch.as_tensor(v) for k, v in artifact.record.tracker.items()})
     tracker.requires_grad_(False)
     own = torch.as_tensor(tubes.cell_reference) == index
     hull = Tube(torch.as_tensor(tubes.tube_lower)[own], torch.as_tensor(tubes.tube_upper)[own]).hull()
     found = attack_tube(
-        ClosedLoop(problem.dynamics, tracker, torch.as_tensor(tubes.references[index])),
+        ClosedLoop(robot, tracker, torch.as_tensor(tubes.references[index])),
         Box(torch.as_tensor(tubes.start_lower[index]), torch.as_tensor(tubes.start_upper[index])),
-        Box(torch.as_tensor(tubes.disturbance_lower), torch.as_tensor(tubes.disturbance_upper)),
+        problem.disturbance,
         hull,
         count=count,
         generator=torch.Generator().manual_seed(seed),
@@ -53,12 +69,20 @@ def attack(path: Path, index: int, count: int, seed: int) -> dict:
     return {"rollouts": found.rollouts, "outside": found.outside, "escapes": found.escapes, "excess": found.excess}
 
 
-def jobs(artifacts: Path) -> list[tuple[Path, int]]:
-    """All references of all certificates and libraries, as (file, index)."""
+def jobs(artifacts: Path) -> list[tuple[Path, int, bool]]:
+    """All references with finite tubes of all certificates and libraries, as (file, index, analytical)."""
     found = []
     for path in sorted([*artifacts.glob("*/certificate.h5"), *artifacts.glob("*/library.h5")]):
         record = Certificate if path.stem == "certificate" else Library
-        found += [(path, i) for i in range(len(read_artifact(path, record).record.tubes.verdict))]
+        content = read_artifact(path, record).record
+        claims = [(content.tubes, False)]
+        if getattr(content, "true_model", None) is not None:
+            claims.append((content.true_model.tubes, True))
+        for tubes, analytical in claims:
+            bounded = np.isfinite(tubes.tube_lower).all((1, 2)) & np.isfinite(tubes.tube_upper).all((1, 2))
+            found += [
+                (path, i, analytical) for i in range(len(tubes.verdict)) if bounded[tubes.cell_reference == i].all()
+            ]
     return found
 
 
@@ -82,13 +106,12 @@ def main() -> int:
     with concurrent.futures.ProcessPoolExecutor(given.processes, mp_context=context) as pool:
         while state["rollouts"] < given.rollouts:
             todo = [references[(state["rounds"] + i) % len(references)] for i in range(given.processes)]
-            futures = [
-                pool.submit(attack, path, index, BATCH, state["rounds"] + i) for i, (path, index) in enumerate(todo)
-            ]
-            for (path, index), future in zip(todo, futures, strict=True):
+            futures = [pool.submit(attack, *job, BATCH, state["rounds"] + i) for i, job in enumerate(todo)]
+            for (path, index, analytical), future in zip(todo, futures, strict=True):
                 found = future.result()
                 entry = state["files"].setdefault(
-                    f"{path.parent.name}/{path.name}#{index}", {"rollouts": 0, "worst": None}
+                    f"{path.parent.name}/{path.name}#{index}{' analytical' * analytical}",
+                    {"rollouts": 0, "worst": None},
                 )
                 entry["rollouts"] += found["rollouts"]
                 entry["worst"] = max(found["excess"], entry["worst"] if entry["worst"] is not None else -float("inf"))
