@@ -5,8 +5,8 @@
 Takes every ``certificate.h5`` and ``library.h5`` below the artifacts folder (run the experiments first), shares the
 rollouts out among the references (of a learned robot, also among those of its analytical model), and compares each
 with the hull of its cells' tubes, in worker processes with one thread each. Writes
-``<artifacts>/benchmarks/campaign.json``, adding to what is there: a campaign can be interrupted and gone on with, and each round draws new rollouts. Ends with
-exit code 1 if a single rollout ever left its tube.
+``<artifacts>/benchmarks/campaign.json``, adding to what is there: a campaign can be interrupted and gone on with, and
+each round draws new rollouts. Ends with exit code 1 if a single rollout ever left its tube.
 """
 
 from __future__ import annotations
