@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.report.canvas import (
     DANGER,
     INK,
@@ -96,7 +97,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
         f"{subject(artifact.header)}: {_deciding(tubes)}; {count} reference{'s' * (count > 1)}, "
         f"{cells} cell{'s' * (cells > 1)}, K = {horizon} ({horizon * dynamics.dt:g} s), "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; "
-        f"{record.falsifier_rollouts} rollouts attacked it",
+        f"{record.falsifier_rollouts} rollouts attacked it{_about_model(record, dynamics)}",
         colour=VERDICT_COLOURS.get(record.verdict, INK),
     )
     return figure
@@ -157,6 +158,18 @@ def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -
     axes.axhline(0, color=DANGER, linewidth=1.1)
     axes.set_ylim(max(-1.0, bottom) - 0.1, 3.0)
     legend(axes, loc="upper right", ncols=len(names), fontsize=7.5)
+
+
+def _about_model(record: Certificate, dynamics: Dynamics) -> str:
+    """Of a learned robot, what is proved of the model that it was learned from; nothing of others."""
+    if record.dynamics is None:
+        return ""
+    model = type(dynamics.analytical).__name__
+    said = f"robot: a network learned from {model}"
+    if record.true_model is None:
+        return f"; {said}"
+    found = sorted(set(record.true_model.tubes.verdict))
+    return f"; {said}, {model} itself: {', '.join(found)} with {len(record.true_model.tubes.cell_reference)} cells"
 
 
 def _deciding(tubes: Tubes) -> str:

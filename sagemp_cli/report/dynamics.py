@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from sagemp_cli.binding import build
 from sagemp_cli.report.canvas import INK, MODES, MUTED, blank_figure, headline, legend, style_axes
@@ -44,6 +44,7 @@ def _draw_errors(axes: Axes, record: DynamicsModel, i: int, label: str) -> None:
     edges, counts = record.error_edges[i], record.error_counts[i]
     axes.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color=MODES[0], alpha=0.75)
     axes.set_yscale("log")
+    axes.xaxis.set_major_locator(MaxNLocator(4))
     found = f"rms {record.error_rms[i]:.2g}, largest {record.error_max[i]:.2g}"
     axes.set_title(found, fontsize=8.5, color=INK, loc="left", pad=3)
 
