@@ -73,7 +73,7 @@ def space_tube(axes: Axes3D, setting: Setting, tubes: Tubes, reference: int) -> 
     axes.plot(path[:, 0], path[:, 1], floor, color=MUTED, linewidth=0.9, alpha=0.6, zorder=0.5)  # its shadow
     hidden = _behind(axes, setting, path)
     for part, zorder in ((hidden, 1.1), (~hidden, 5)):
-        segments = [path[k : k + 2] for k in np.flatnonzero(part[:-1])]
+        segments = [path[k : k + 2] for k in np.flatnonzero(part[:-1]) if k % 3 < 2]  # dashes
         axes.add_collection3d(
             Line3DCollection(segments, colors=REFERENCE, linewidths=1.3, zorder=zorder), autolim=False
         )
