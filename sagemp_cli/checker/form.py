@@ -93,20 +93,23 @@ class Step:
 
     def relax(self, name: str, function: Function, rows: arb_mat) -> arb_mat:
         """``function`` of the value of every row."""
-        count = rows.nrows()
-        if self.states is None:
-            return self.joined([self.constant(function.value(rows[i, 0])) for i in range(count)])
-        entries = self._take(name, count)
-        slopes = [ball(slope) for slope, _, _ in entries]
-        out = arb_mat(count, count, [slopes[i] if i == j else 0 for i in range(count) for j in range(count)]) * rows
-        for i, ((lower, upper), entry) in enumerate(zip(self.bounds(rows), entries, strict=True)):
-            least, most = function.excess(slopes[i], lower, upper)
-            self._put(name, out, i, least, most, entry)
-        return out
+        return self.joined(self._relaxed(name, function, self._scalars(rows), rows))
 
     def apply(self, name: str, function: Function, x: Form) -> Form:
         """``function`` of every entry of a form."""
-        return self.split(self.relax(name, function, self.joined(list(x.values.flat))), x.shape)
+        return Form(self, array_of(self._relaxed(name, function, list(x.values.flat), x.rows()), x.shape))
+
+    def _relaxed(self, name: str, function: Function, scalars: Sequence[Scalar], rows: arb_mat) -> list[Scalar]:
+        """``function`` of every number, which are the rows of a matrix."""
+        if self.states is None:
+            return [self.constant(function.value(s.row[0, 0])) for s in scalars]
+        entries, out = self._take(name, len(scalars)), []
+        for scalar, (lower, upper), entry in zip(scalars, self.bounds(rows), entries, strict=True):
+            slope = ball(entry[0])
+            least, most = function.excess(slope, lower, upper)
+            out.append(scalar.times(slope))
+            self._put(name, out[-1].row, 0, least, most, entry)
+        return out
 
     def product(self, a: Form, b: Form) -> Form:
         """Product of forms whose deviations X and Y may be correlated: ``X Y = (P^2 - M^2) / 4`` with
@@ -148,9 +151,11 @@ class Step:
 
     def split(self, rows: arb_mat, shape: tuple[int, ...]) -> Form:
         """A matrix's rows as a form."""
+        return Form(self, array_of(self._scalars(rows), shape), rows)
+
+    def _scalars(self, rows: arb_mat) -> list[Scalar]:
         flat, width = rows.entries(), self.width
-        scalars = [Scalar(arb_mat(1, width, flat[i : i + width])) for i in range(0, len(flat), width)]
-        return Form(self, array_of(scalars, shape))
+        return [Scalar(arb_mat(1, width, flat[i : i + width])) for i in range(0, len(flat), width)]
 
     def _take(self, name: str, count: int) -> Sequence[Entry]:
         found, entries = next(self._record, ("nothing", ()))
@@ -174,9 +179,10 @@ class Step:
 class Form:
     """An array of :class:`Scalar` that answers torch's operations; no batch dimensions."""
 
-    def __init__(self, step: Step, values: np.ndarray) -> None:
+    def __init__(self, step: Step, values: np.ndarray, rows: arb_mat | None = None) -> None:
         self.step = step
         self.values = values
+        self._rows = rows
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -189,7 +195,9 @@ class Form:
 
     def rows(self) -> arb_mat:
         """All entries as one matrix."""
-        return self.step.joined(list(self.values.flat))
+        if self._rows is None:
+            self._rows = self.step.joined(list(self.values.flat))
+        return self._rows
 
     def __getitem__(self, index: Any) -> Form:
         return Form(self.step, _array(self.values[index]))
@@ -304,8 +312,10 @@ def _linear(x: Form, weight: torch.Tensor, bias: torch.Tensor | None = None) -> 
     if x.dim() != 1:
         raise UnsupportedOperationError("the checker knows linear layers on vectors only")
     matrix = arb_mat(*weight.shape, [ball(v) for v in weight.detach().double().flatten().tolist()])
-    y = x.step.split(matrix * x.rows(), (weight.shape[0],))
-    return y if bias is None else y + bias
+    rows = matrix * x.rows()
+    for i, value in enumerate([] if bias is None else bias.detach().double().tolist()):
+        rows[i, 0] = rows[i, 0] + ball(value)
+    return x.step.split(rows, (weight.shape[0],))
 
 
 def _clamp(x: Form, min: float | None = None, max: float | None = None) -> Form:  # noqa: A002  (torch's names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from sagemp_cli.closed_loop import ClosedLoop, FoldedLoop
@@ -32,5 +33,5 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
         own = loop.references.shape[:-2]
     elif isinstance(loop, FoldedLoop):
         own = loop.biases.shape[:-2]
-    shape = (*torch.broadcast_shapes(own, start.lower.shape[:-1]), n)
+    shape = (*np.broadcast_shapes(own, start.lower.shape[:-1]), n)
     return Box(start.lower.expand(shape), start.upper.expand(shape))

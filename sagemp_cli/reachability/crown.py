@@ -17,7 +17,8 @@ from torch import Tensor
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine import Affine, AffineRun
 from sagemp_cli.reachability.affine_form import Hints, Relaxed
-from sagemp_cli.reachability.backward import backward, compiled
+from sagemp_cli.reachability.backward import backward
+from sagemp_cli.reachability.backward_steps import compiled
 from sagemp_cli.reachability.batch import batched_start
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.relaxations.band import UNIT
@@ -66,7 +67,7 @@ def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -
     steps = compiled(run.steps)
     joining = 2 * start.dim
     if inputs:
-        joining += max(sum(r.input.shape[-2] for r in s.replacements if r.input is not None) for s in steps)
+        joining += max(sum(r.inputs.rows.shape[-1] for r in s.replacements if r.inputs is not None) for s in steps)
     size = max(1, rows // joining)
     lowers, uppers, hints = [start.lower[..., None, :]], [start.upper[..., None, :]], []
     for first in range(0, len(steps), size):

@@ -5,7 +5,7 @@ costs several tensor operations on a few numbers. So a loop whose steps differ i
 (:class:`FoldableLoop`) is evaluated once on :class:`FoldedForm`, values that are known as fixed combinations of the
 step's *basic* values: 1, the given numbers, the states, the disturbances, and the results of the nonlinear operations
 before. What comes out, the :class:`Plan`, says which nonlinear operations there are and which combinations go into
-them; :mod:`sagemp_cli.reachability.planned_step` evaluates them.
+them; :mod:`sagemp_cli.reachability.planned_run` evaluates them.
 
 Rounding. A coefficient as computed differs from the exact one by at most ``error`` times its entry in ``sizes``, which
 obeys the same recurrences with absolute values: as for :mod:`~sagemp_cli.reachability.affine_form`, entry by entry.
@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -289,7 +290,7 @@ def divide(a: Any, b: Any) -> FoldedForm:
 def _of_several(kind: Literal["product", "quotient"], *operands: FoldedForm) -> FoldedForm:
     """The result of an operation whose operands are broadcast to one shape."""
     forms = _same(*operands)
-    shape = torch.broadcast_shapes(*(f.shape for f in forms))
+    shape = np.broadcast_shapes(*(f.shape for f in forms))
     parts = [f.moved_by(lambda t: t.expand(*shape, -1)).combination() for f in forms]
     matrix, sizes = (torch.cat([part[i] for part in parts]) for i in range(2))
     node = Node(kind, Combination(matrix, sizes, max(f.error for f in forms)), math.prod(shape))

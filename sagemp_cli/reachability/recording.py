@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -84,7 +85,7 @@ class Recording:
 
 def _own(band: Band, batch: torch.Size) -> torch.Size:
     """The event shape of a band."""
-    return torch.broadcast_shapes(*(part.shape for part in band))[len(batch) :]
+    return torch.Size(np.broadcast_shapes(*(part.shape for part in band))[len(batch) :])
 
 
 def _packed(masks: Sequence[Tensor], batch: torch.Size) -> Tensor:

@@ -2,11 +2,13 @@
 
 Two reasons to drop a generator. It may be *negligible*: of a neuron that does not straddle its kink, or of an error
 that the feedback has contracted for hundreds of steps, hardly more is left than rounding; or there may be more
-generators than a limit allows. Either way what is dropped is enclosed by a box, so both are sound.
+generators than a limit allows. Either way what is dropped is enclosed by a box, so both are sound. Not both at once:
+with a limit, negligible ones are the last to be kept anyway, and boxing them early made tubes wider (by 0.2 %).
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +21,7 @@ A box around m of them adds at most ``m`` times as much to the radius: a million
 
 
 def reduce_generators(generators: Tensor, limit: int | None = None) -> tuple[Tensor, Tensor]:
-    """Drop negligible generators, and if there are more than ``limit`` then, keep those that matter most.
+    """Drop negligible generators; or if there is a limit, all but those that matter most.
 
     Sound: the dropped generators ``g_j`` are enclosed by the box of radius ``sum_j |g_j|`` (rounded up).
 
@@ -31,30 +33,65 @@ def reduce_generators(generators: Tensor, limit: int | None = None) -> tuple[Ten
         Generators, the kept ones first and in their old order, then (if any were dropped) the n of the box; and the
         mask of the kept ones, ``(M,)`` if it is the same for the whole batch, else ``(*batch, M)``.
     """
-    n, count = generators.shape[-2:]
-    with torch.no_grad():  # what is kept is a choice: any is sound
-        size = generators.abs()
-        radius = size.sum(-1, keepdim=True)
-        mask = (size > NEGLIGIBLE * radius).flatten(0, -2).any(0)
-        index = mask.nonzero()[:, 0]
-    limit = count if limit is None else max(limit, n + 1)
-    if index.shape[0] + n <= limit and index.shape[0] + n < count:
-        dropped = (~mask).nonzero()[:, 0]
-        return _boxed(generators.index_select(-1, index), generators.index_select(-1, dropped)), mask
-    if count <= limit:
-        return generators, torch.ones_like(mask)
+    batch, (n, count) = generators.shape[:-2], generators.shape[-2:]
+    flat = generators.reshape(-1, n, count)
+    chosen = _chosen(np.abs(flat.detach().numpy()), limit)
+    if chosen is None:
+        return generators, torch.ones(count, dtype=torch.bool)
+    mask = torch.from_numpy(chosen)
+    if mask.dim() == 1:
+        kept, dropped = generators[..., mask], generators[..., ~mask]
+    else:
+        mask = mask.reshape(*batch, count)
+        every = mask[..., None, :].expand(generators.shape)
+        kept, dropped = (generators[part].reshape(*batch, n, -1) for part in (every, ~every))
+    radius = dropped.abs().sum(-1) * _rounded_up(dropped.shape[-1])
+    return torch.cat([kept, torch.diag_embed(radius)], dim=-1), mask
+
+
+def reduce_arrays(generators: np.ndarray, limit: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """As :func:`reduce_generators` for an array ``(B, n, M)``; the mask is None where all are kept."""
+    cells, n, _ = generators.shape
+    size = np.abs(generators)
+    mask = _chosen(size, limit)
+    if mask is None:
+        return generators, None
+    if mask.ndim == 1:
+        kept, dropped = generators[..., mask], size[..., ~mask]
+    else:
+        every = np.broadcast_to(mask[:, None], generators.shape)
+        kept, dropped = generators[every].reshape(cells, n, -1), size[~every].reshape(cells, n, -1)
+    count = kept.shape[-1]
+    reduced = np.zeros((cells, n, count + n))
+    reduced[..., :count] = kept
+    radius = np.add.reduce(dropped, axis=-1) * _rounded_up(dropped.shape[-1])
+    reduced.reshape(cells, -1)[:, count :: count + n + 1] = radius
+    return reduced, mask
+
+
+def _rounded_up(count: int) -> float:
+    """What makes a computed sum of so many magnitudes an upper bound."""
+    return 1.0 + 2 * (count + 2) * UNIT
+
+
+@np.errstate(all="ignore")  # where a set has overflowed any choice will do
+def _chosen(size: np.ndarray, limit: int | None) -> np.ndarray | None:
+    """Which generators are kept, ``(M,)`` or ``(B, M)``, from their absolute values ``(B, n, M)``; None for all.
+
+    Any choice is sound.
+    """
+    cells, n, count = size.shape
+    boxed = 0 if limit is None else count - max(limit, n + 1) + n
+    if limit is not None and boxed <= n:
+        return None
+    radius = np.add.reduce(size, axis=-1)[..., None]
+    if limit is None:
+        mask = (size > NEGLIGIBLE * radius).any((0, 1))
+        return mask if int(mask.sum()) + n < count else None
     # What boxing costs: a generator along an axis loses nothing, so rank by 1-norm minus largest entry, per unit of
     # state scale.
-    weight = size / radius.clamp(min=1e-300)
-    loss = weight.sum(-2) - weight.amax(-2)
-    order = loss.argsort(dim=-1, descending=True)
-    index = order[..., : limit - n].sort(dim=-1).values
-    kept = generators.gather(-1, index[..., None, :].expand(*generators.shape[:-1], -1))
-    boxed = generators.gather(-1, order[..., None, limit - n :].expand(*generators.shape[:-1], -1))
-    return _boxed(kept, boxed), torch.zeros_like(loss, dtype=torch.bool).scatter_(-1, index, True)
-
-
-def _boxed(kept: Tensor, dropped: Tensor) -> Tensor:
-    """The kept generators and a box around the sum of the others."""
-    radius = dropped.abs().sum(-1) * (1.0 + 2 * (dropped.shape[-1] + 2) * UNIT)
-    return torch.cat([kept, torch.diag_embed(radius)], dim=-1)
+    weight = size / np.maximum(radius, 1e-300)
+    loss = np.add.reduce(weight, axis=-2) - np.maximum.reduce(weight, axis=-2)
+    mask = np.zeros((cells, count), dtype=bool)
+    np.put_along_axis(mask, np.argpartition(loss, boxed, axis=-1)[:, boxed:], True, axis=-1)
+    return mask

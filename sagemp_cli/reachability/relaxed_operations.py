@@ -47,6 +47,7 @@ def _scalar(name: str, operation: Operation, *functions: Any) -> None:
 _SINE = Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range, arrays=True)
 _COSINE = Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range, arrays=True)
 _LEAKY_RELU = Operation(_leaky_relu.band, _leaky_relu.lines, _leaky_relu.value_range, arrays=True)
+_RECIPROCAL = Operation(_reciprocal.band, _reciprocal.lines, _reciprocal.value_range, arrays=True)
 _SOFTPLUS, _ELU, _POWER, _CLAMP = map(_of, (_softplus, _elu, _power, _clamp))
 
 _scalar("sin", _SINE, torch.sin, torch.Tensor.sin)
@@ -60,7 +61,7 @@ _scalar("exp", _of(_exponential), torch.exp, torch.Tensor.exp)
 _scalar("log", _of(_logarithm), torch.log, torch.Tensor.log)
 _scalar("sqrt", _of(_square_root), torch.sqrt, torch.Tensor.sqrt)
 _scalar("abs", _of(_absolute), torch.abs, torch.absolute, torch.Tensor.abs, torch.Tensor.absolute, torch.Tensor.__abs__)
-_scalar("reciprocal", _of(_reciprocal), torch.reciprocal, torch.Tensor.reciprocal)
+_scalar("reciprocal", _RECIPROCAL, torch.reciprocal, torch.Tensor.reciprocal)
 
 
 @handles(torch.relu, torch.Tensor.relu, nn.functional.relu)

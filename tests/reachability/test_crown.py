@@ -2,17 +2,18 @@
 
 from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.reachability import backward as backward_module
+from sagemp_cli.reachability import backward_steps, lirpa_adapter
 from sagemp_cli.reachability import crown as crown_module
-from sagemp_cli.reachability import lirpa_adapter
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.auto_lirpa import AutoLirpa
-from sagemp_cli.reachability.backward import Product, Step, _split, _swept, _tilted, compiled
+from sagemp_cli.reachability.backward import _swept, _tilt
+from sagemp_cli.reachability.backward_steps import Product, Step, compiled
 from sagemp_cli.reachability.best import Best
 from sagemp_cli.reachability.crown import Crown
 from sagemp_cli.reachability.inner import attack_tube
@@ -28,7 +29,7 @@ def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monk
         parts = zip(*(parallel(r.band) for r in group), strict=True)
         return (torch.stack(part).reshape(shape) for part in parts)
 
-    monkeypatch.setattr(backward_module, "_lines", edges)
+    monkeypatch.setattr(backward_steps, "_lines", edges)
     for loop, start, w in (
         (unicycle_loop(line(0.3)), START, DISTURBANCE),
         (EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.1] * 3), Box.around([0.0] * 3, [0.01] * 3)),
@@ -46,44 +47,52 @@ def test_tilted_planes_contain_products_and_those_of_mccormick_are_among_them():
         factor = x * (1 - abs(correlation)) + y * correlation
         total, difference = factor + y, factor - y
         plus, minus = total.abs().max(), difference.abs().max()
-        zero = torch.zeros(1, 2, dtype=torch.float64)
-        product = Product(
-            tilts=torch.eye(2, dtype=torch.float64),  # the variables are M and P themselves
-            top=0.25 * torch.stack([plus**2, minus**2])[None],
-            free=torch.stack([min(minus, 2 - plus), min(plus, 2 - minus)])[None],
-            size=zero + 1,
-            offset=zero,
-            middle=zero,
-            magnitude=zero + 2,
-            rounding=zero,
-        )
-        for guess in torch.linspace(-2, 2, 9, dtype=torch.float64):
-            likely = guess.expand(1, 2)
-            for sign in (1.0, -1.0):
-                gain, _, m, p = _tilted(_split(torch.tensor([[sign]], dtype=torch.float64)), product, likely)[0]
-                excess = gain + m * difference + p * total - sign * factor * y
-                assert float(excess.min()) > -1e-12
+
+        def both(upper, lower):
+            return np.array([upper, lower], dtype=float)[None, :, None]
+
+        def product(guess):
+            return Product(
+                tilts=np.eye(2)[None],  # the variables are M and P themselves
+                likely=both(guess, guess) * np.array([1.0, 0.0]),
+                top=0.25 * both(plus**2, minus**2),
+                free=both(min(minus, 2 - plus), min(plus, 2 - minus)),
+                size=both(1, 1),
+                offset=both(0, 0),
+                middle=both(0, 0),
+                magnitude=both(2, 2),
+                rounding=both(0, 0),
+            )
+
+        for guess in np.linspace(-2, 2, 9):
+            for upper, lower in ((1.0, 0.0), (0.0, 1.0)):  # of a row of +1 and of one of -1
+                head = np.zeros((1, 4, 1))
+                head[0, 2] = 1e-12  # of a row its direction decides, so it need not add anything to speak of
+                _tilt(head, both(upper, lower), product(guess), np.eye(2)[None], np.zeros((0, 1)))
+                gain, _, m, p = head[0, :, 0].tolist()
+                excess = gain + m * difference + p * total - (upper - lower) * factor * y
+                assert float(excess.min()) > -1e-11
                 if correlation == 0 and abs(guess) == 2:
                     # McCormick's planes touch the product at three of the four corners.
-                    assert int((excess[-4:].abs() < 1e-12).sum()) == 3
+                    assert int((excess[-4:].abs() < 1e-11).sum()) == 3
 
 
 def broken(step: Step, kind: str) -> Step:
     """A step with one mistake."""
     if kind == "disturbance forgotten":
         first = step.replacements[0]
-        return step._replace(replacements=(first._replace(lines=0 * first.lines), *step.replacements[1:]))
+        return step._replace(replacements=(first._replace(radius=0 * first.radius), *step.replacements[1:]))
     changed = []
     for r in step.replacements:
         entries = r.last - r.first
-        if kind == "upper and lower lines exchanged" and r.input is not None:
-            r = r._replace(lines=torch.cat([r.lines[..., entries:, :], r.lines[..., :entries, :]], dim=-2))
-        if kind == "slopes of lines reversed" and r.input is not None:
-            r = r._replace(lines=torch.cat([r.lines[..., :2], -r.lines[..., 2:]], dim=-1))
-        if kind == "offsets of lines halved" and r.input is not None:
-            r = r._replace(lines=torch.cat([0.5 * r.lines[..., :2], r.lines[..., 2:]], dim=-1))
+        if kind == "upper and lower lines exchanged" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([r.lines[..., entries:], r.lines[..., :entries]], axis=-1))
+        if kind == "slopes of lines reversed" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([r.lines[:, :2], -r.lines[:, 2:]], axis=-2))
+        if kind == "offsets of lines halved" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([0.5 * r.lines[:, :2], r.lines[:, 2:]], axis=-2))
         if kind == "planes too low" and r.product is not None:
-            r = r._replace(product=r.product._replace(top=0.2 * r.product.top), lines=0.2 * r.lines)
+            r = r._replace(product=r.product._replace(top=0.2 * r.product.top), radius=0.2 * r.radius)
         changed.append(r)
     return step._replace(replacements=tuple(changed))
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from sagemp_cli.reachability import affine, planned_run
+from sagemp_cli.reachability import affine, planned_operations, planned_run
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.best import Best
 from sagemp_cli.reachability.crown import Crown
@@ -122,8 +122,8 @@ def test_a_smaller_radius_than_a_relaxation_has_is_found_out(name, monkeypatch):
         return bool(((states < tube.lower - 1e-12) | (states > tube.upper + 1e-12)).any())
 
     assert not escapes()
-    honest = planned_run._States.rows
-    monkeypatch.setattr(planned_run._States, "rows", lambda self, c, extra=0: 0.3 * honest(self, c, extra))
+    honest = planned_operations.States.rows
+    monkeypatch.setattr(planned_operations.States, "rows", lambda self, c, extra=0: 0.3 * honest(self, c, extra))
     assert escapes()
 
 

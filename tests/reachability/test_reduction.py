@@ -1,11 +1,12 @@
 """Dropped generators are enclosed, and which were dropped is told."""
 
+import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.reachability.reduction import NEGLIGIBLE, reduce_generators
+from sagemp_cli.reachability.reduction import NEGLIGIBLE, reduce_arrays, reduce_generators
 
 from .propagator_cases import DISTURBANCE, START, line, unicycle_loop
 
@@ -37,6 +38,16 @@ def test_only_what_is_negligible_in_every_cell_and_state_is_dropped():
     assert mask.tolist() == [j == 7 or j >= 30 for j in range(40)] and reduced.shape == (3, 4, 11 + 4)
     widened = reduced.abs().sum(-1) / g.abs().sum(-1)
     assert bool((widened >= 1 - 1e-14).all()) and float(widened.max()) < 1 + 1e-11
+
+
+@pytest.mark.parametrize("limit", [None, 30, 12, 1])
+def test_arrays_are_reduced_as_tensors_are(limit):
+    g = drawn(small=range(5, 25))
+    for some in (g, g[..., 25:]):
+        tensor, mask = reduce_generators(some, limit)
+        array, kept = reduce_arrays(some.numpy(), limit)
+        np.testing.assert_allclose(array, tensor.numpy(), rtol=1e-14, atol=0)
+        assert bool(mask.all()) if kept is None else np.array_equal(kept, mask.numpy())
 
 
 def test_few_negligible_generators_stay_because_a_box_is_not_smaller():

@@ -9,12 +9,16 @@ The best slope. The band's radius is a convex function of the slope, and so is t
 the lower one (each is a maximum of functions linear in the slope). On a single piece the chord is best for the band;
 where an interval holds an inflection the minimum is found by cutting planes: each evaluation adds the line that its
 extreme points define, and the next slope is where the last lines on either side meet (a Remez exchange).
+
+Bands are made of tensors, and where a curve's own functions are written for both
+(:mod:`~sagemp_cli.reachability.relaxations.functions`), of arrays.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,6 +28,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
 
 _GOOD = 2e-4  # a slope whose objective is this close to the best, in units of the excess's range, is not refined
@@ -93,14 +98,15 @@ def band(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None =
         allowed: intervals inside the function's domain; elsewhere the band claims nothing.
     """
     lower, upper, outside = _confined(lower, upper, allowed)
-    ends = torch.stack([lower, upper])
+    m = functions_of(lower)
+    ends = m.stack([lower, upper])
     values = curve.value(ends)
     slope = _chord(curve, ends, values)
     crossing = _crossing(curve, lower, upper)
     if crossing is not None and bool(crossing.any()):
-        slope = torch.where(crossing, _searched(curve, ends, values, radius_objective), slope)
+        slope = m.where(crossing, _searched(curve, ends, values, radius_objective), slope)
     found = excess(curve, slope, ends, values)
-    radius = 0.5 * (found.most - found.least) + (found.most.abs() + found.least.abs()) * (2 * UNIT) + outside
+    radius = 0.5 * (found.most - found.least) + (abs(found.most) + abs(found.least)) * (2 * UNIT) + outside
     return settled(slope, 0.5 * (found.most + found.least), radius)
 
 
@@ -123,35 +129,36 @@ def lines(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None 
 
 def excess(curve: Curve, slope: Tensor, ends: Tensor, values: Tensor) -> Excess:
     """Sound bounds of ``f(x) - slope x`` between the ends ``(2, ...)``, for any slope; ``values`` are f at the ends."""
+    m = functions_of(ends)
     lower, upper = ends[0], ends[1]
     at_ends, error = _tilted(curve, slope, ends, values)
     low, high = at_ends - error, at_ends + error
-    least, most = low.amin(0), high.amax(0)
-    lowest, highest = torch.where(low[0] <= low[1], lower, upper), torch.where(high[0] >= high[1], lower, upper)
+    least, most = m.amin(low, 0), m.amax(high, 0)
+    lowest, highest = m.where(low[0] <= low[1], lower, upper), m.where(high[0] >= high[1], lower, upper)
     for piece in curve.pieces:
         start, end = _part(piece.start, lower, upper), _part(piece.end, lower, upper)
         if len(curve.pieces) > 1 and not bool((start < end).any()):
             continue
-        with torch.no_grad():  # any point of the piece will do, so for autograd it is a constant
-            t = torch.minimum(torch.fmax(piece.touch(slope, start, end), start), end)
+        with constant(ends):  # any point of the piece will do
+            t = m.minimum(m.fmax(piece.touch(slope, start, end), start), end)
             derivative = curve.derivative(t)
         at_t, error = _tilted(curve, slope, t, curve.value(t))
         tilt = derivative - slope
         left, right = (t - start) * tilt, (t - end) * tilt
-        error = error + (end - start) * ((derivative.abs() + slope.abs() + curve.derivative_floor) * curve.margin)
+        error = error + (end - start) * ((abs(derivative) + abs(slope) + curve.derivative_floor) * curve.margin)
         if piece.convex:
-            bound = at_t - error - torch.maximum(left, right)
-            lowest, least = torch.where(bound < least, t, lowest), torch.minimum(bound, least)
+            bound = at_t - error - m.maximum(left, right)
+            lowest, least = m.where(bound < least, t, lowest), m.minimum(bound, least)
         else:
-            bound = at_t + error - torch.minimum(left, right)
-            highest, most = torch.where(bound > most, t, highest), torch.maximum(bound, most)
+            bound = at_t + error - m.minimum(left, right)
+            highest, most = m.where(bound > most, t, highest), m.maximum(bound, most)
     return Excess(least, most, lowest, highest)
 
 
 def _tilted(curve: Curve, slope: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """``f(x) - slope x`` as computed, and a bound of its error."""
     line = slope * x
-    return value - line, (value.abs() + line.abs()) * curve.margin + curve.floor
+    return value - line, (abs(value) + abs(line)) * curve.margin + curve.floor
 
 
 def best_slope(
@@ -197,6 +204,8 @@ def best_slope(
 
 @torch.no_grad()
 def _searched(curve: Curve, ends: Tensor, values: Tensor, objective: Objective) -> Tensor:
+    if not isinstance(ends, Tensor):
+        return on_tensors(lambda e, v: _searched(curve, e, v, objective), ends, values)
     return best_slope(
         lambda slope: excess(curve, slope, ends, values),
         ends[0],
@@ -225,31 +234,34 @@ def _part(boundary: float | Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """A piece's boundary, moved into the interval."""
     if isinstance(boundary, float) and math.isinf(boundary):
         return lower if boundary < 0 else upper
-    return torch.minimum(lower.clamp(min=boundary), upper)
+    m = functions_of(lower)
+    return m.minimum(m.clamp(lower, min=boundary), upper)
 
 
 def _crossing(curve: Curve, lower: Tensor, upper: Tensor) -> Tensor | None:
     """Whether an inflection lies inside; None if there is none at all."""
     inside = [(lower < piece.start) & (piece.start < upper) for piece in curve.pieces[1:]]
-    return functools.reduce(torch.logical_or, inside) if inside else None
+    return functools.reduce(operator.or_, inside) if inside else None
 
 
 def _chord(curve: Curve, ends: Tensor, values: Tensor) -> Tensor:
     """Slope of the chord, or where that would be rounding only, of the tangent at the middle."""
     width = ends[1] - ends[0]
-    wide = width > 1e-6 * ends.abs().sum(0) + TINY
+    wide = width > 1e-6 * (abs(ends[0]) + abs(ends[1])) + TINY
     rise = values[1] - values[0]
     if bool(wide.all()):
         return rise / width
-    return torch.where(wide, rise / torch.where(wide, width, 1.0), curve.derivative(0.5 * ends[0] + 0.5 * ends[1]))
+    m = functions_of(width)
+    return m.where(wide, rise / m.where(wide, width, 1.0), curve.derivative(0.5 * ends[0] + 0.5 * ends[1]))
 
 
 def _confined(lower: Tensor, upper: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor, Tensor | float]:
     """Intervals to compute with, 1 where nothing can be said, and what to add to the radius: infinity there."""
-    good = torch.isfinite(lower) & torch.isfinite(upper)
+    m = functions_of(lower)
+    good = m.isfinite(lower) & m.isfinite(upper)
     if allowed is not None:
         good = good & allowed
     if bool(good.all()):
         return lower, upper, 0.0
-    one, zero = torch.ones_like(lower), torch.zeros_like(lower)
-    return torch.where(good, lower, one), torch.where(good, upper, one), torch.where(good, zero, zero + math.inf)
+    zero = m.zeros_like(lower)
+    return m.where(good, lower, 1.0), m.where(good, upper, 1.0), m.where(good, zero, zero + math.inf)

@@ -11,7 +11,6 @@ cubic), so the chord from that end to there is as good to higher order. Wide int
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import UNIT, Band, settled
-from sagemp_cli.reachability.relaxations.functions import functions_of, on_tensors
+from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import (
     Excess,
@@ -220,7 +219,7 @@ def _extrema(wave: _Wave, slope: Tensor, ends: Tensor, values: Tensor) -> tuple[
     minus its place.
     """
     m = functions_of(slope)
-    with torch.no_grad() if m is torch else contextlib.nullcontext():
+    with constant(slope):
         base = m.stack(wave.turns(slope))
         height = m.sqrt((1.0 - slope) * (1.0 + slope))
         turns = (ends[:, None] - base) * (1.0 / _TWO_PI)
