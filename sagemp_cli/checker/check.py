@@ -149,6 +149,11 @@ def _dynamics(config: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> D
     model = target_class(section, "dynamics")  # from an allow-list of this package's own classes
     if not issubclass(model, Dynamics):
         raise TypeError(f"dynamics: {model.__name__} is not a robot model")
+    hidden, stored = section.get("hidden", []), sum(value.size for value in weights.values())
+    if sum(hidden) + sum(a * b for a, b in zip(hidden, hidden[1:], strict=False)) > stored:
+        raise ValueError(
+            f"dynamics.hidden is {hidden}, but the file holds {stored} weights"
+        )  # before room is made for it
     robot = model(**{key: value for key, value in section.items() if key != "_target_"}).double().eval()
     wanted = robot.state_dict()
     if weights.keys() != wanted.keys():

@@ -24,9 +24,9 @@ from torch import Tensor
 import sagemp_cli.reachability.affine_operations  # noqa: F401  (gives the forms their operations)
 import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
 from sagemp_cli.closed_loop import ClosedLoop
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine_form import AffineForm, Hints, StepFrame
-from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable
+from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable, speaks_for_itself
 from sagemp_cli.reachability.planned_run import planned_run
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.recording import Recording
@@ -121,7 +121,9 @@ class Affine:
             watch: bound the controls, of a :class:`~sagemp_cli.closed_loop.ClosedLoop`.
         """
         steps = loop.horizon if horizon is None else horizon
-        if isinstance(loop, FoldableLoop) and not torch.is_grad_enabled():
+        if watch and type(loop).step is not ClosedLoop.step:
+            raise UsageError(f"{type(loop).__name__} has a step of its own; controls are bounded of a ClosedLoop only")
+        if isinstance(loop, FoldableLoop) and speaks_for_itself(loop) and not torch.is_grad_enabled():
             wanted = {"symbols": self.symbols, "hints": hints, "keep_steps": keep_steps, "watch": watch}
             with contextlib.suppress(NotFoldable):
                 found = planned_run(loop, start, disturbance, steps, **wanted)

@@ -65,7 +65,8 @@ def _expand(form: AffineForm, shape: torch.Size, size: int) -> tuple[Tensor, Ten
 def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
     """Sum of forms and constants."""
     if alpha != 1:
-        b = multiply(b, alpha) if isinstance(b, AffineForm) else b * alpha
+        # A constant of less precision would be rounded to it.
+        b = multiply(b, alpha) if isinstance(b, AffineForm) else torch.as_tensor(b, dtype=torch.float64) * alpha
     if not isinstance(a, AffineForm):
         a, b = b, a
     if not isinstance(b, AffineForm):
@@ -83,7 +84,9 @@ def add(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
 @handles(torch.sub, torch.Tensor.sub, torch.Tensor.__sub__)
 def subtract(a: Any, b: Any, *, alpha: float = 1) -> AffineForm:
     """Difference."""
-    return add(a, multiply(b, -alpha) if isinstance(b, AffineForm) else -b * alpha)
+    return add(
+        a, multiply(b, -alpha) if isinstance(b, AffineForm) else b, alpha=1 if isinstance(b, AffineForm) else -alpha
+    )
 
 
 @handles(torch.rsub, torch.Tensor.__rsub__)

@@ -35,6 +35,9 @@ class NotFoldable(Exception):
 class FoldableLoop(Protocol):
     """A loop whose steps are the same but for some numbers.
 
+    ``step_given`` is evaluated once for all sets, so it must not look at values, and its dimensions count from the end:
+    there may be any batch in front.
+
     Attributes:
         given_dim: dimensions of these, without batch.
     """
@@ -46,6 +49,17 @@ class FoldableLoop(Protocol):
 
     def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor | None]:
         """The next state ``(..., n)`` and, where there is one, the control."""
+
+
+def speaks_for_itself(loop: Any) -> bool:
+    """Whether a loop's ``step_given`` says what its ``step`` does: whether none of its classes came later with another
+    ``step`` or ``control``.
+    """
+    kinds = type(loop).__mro__
+    last = next((i for i, kind in enumerate(kinds) if "step_given" in vars(kind)), None)
+    if last is None or any(name in getattr(loop, "__dict__", {}) for name in ("step", "control")):
+        return False
+    return not any(name in vars(kind) for kind in kinds[:last] for name in ("step", "control"))
 
 
 class Combination(NamedTuple):
@@ -213,8 +227,9 @@ class FoldedForm(Form):
 
     def __getitem__(self, index: Any) -> FoldedForm:
         index = index if isinstance(index, tuple) else (index,)
-        full = (*index, slice(None)) if any(i is Ellipsis for i in index) else index
-        return self.moved_by(lambda t: t[full])
+        if index[:1] != (Ellipsis,) or sum(i is not None for i in index[1:]) >= self.dim():
+            raise NotFoldable  # the batch in front is any batch, not this one
+        return self.moved_by(lambda t: t[(*index, slice(None))])
 
 
 FoldedForm.handlers = {}
@@ -244,7 +259,9 @@ def _tiny(sizes: Tensor) -> Tensor:
 @handles(torch.add, torch.Tensor.add, torch.Tensor.__add__, torch.Tensor.__radd__)
 def add(a: Any, b: Any, *, alpha: float = 1) -> FoldedForm:
     """Sum of forms and constants."""
-    x, y = _same(a, b if alpha == 1 else b * alpha)
+    if alpha != 1:
+        b = multiply(b, alpha) if isinstance(b, FoldedForm) else torch.as_tensor(b, dtype=torch.float64) * alpha
+    x, y = _same(a, b)
     # Two units: the second is for the rounding of alpha times a constant.
     return FoldedForm(x.noted, x.rows + y.rows, x.sizes + y.sizes, max(x.error, y.error) + 2 * UNIT)
 
@@ -320,13 +337,19 @@ def total(x: FoldedForm, dim: Any = None, keepdim: bool = False) -> FoldedForm:
     """Sum over one event dimension."""
     if not isinstance(dim, int):
         raise UnsupportedOperationError(f"torch operation 'sum' is supported over one dimension, found dim={dim}")
-    summed = x.moved_by(lambda t: t.sum(_of_columns(dim), keepdim))
+    summed = x.moved_by(lambda t: t.sum(_of_columns(dim, x.dim()), keepdim))
     return FoldedForm(x.noted, summed.rows, summed.sizes, x.error + x.shape[dim] * UNIT)
 
 
-def _of_columns(dim: int) -> int:
-    """A dimension where there is one more, the columns."""
-    return dim if dim >= 0 else dim - 1
+def _of_columns(dim: int, dims: int) -> int:
+    """A dimension, counted from the end and behind the batch, where there is one more, the columns.
+
+    Raises:
+        NotFoldable: it is counted from the front, or is the batch.
+    """
+    if not -dims < dim < 0:
+        raise NotFoldable
+    return dim - 1
 
 
 @handles(torch.stack)
@@ -344,32 +367,35 @@ def cat(values: Sequence[Any], dim: int = 0) -> FoldedForm:
 def _joined(join: Callable[..., Tensor], values: Sequence[Any], dim: int) -> FoldedForm:
     most = max(len(v.shape) for v in values if isinstance(v, FoldedForm))
     forms = [f if f.dim() == most else f.moved_by(lambda t: t[None]) for f in _same(*values)]  # constants lack a batch
-    rows, sizes = (join([getattr(f, part) for f in forms], _of_columns(dim)) for part in ("rows", "sizes"))
+    at = _of_columns(dim, most + (join is torch.stack))
+    rows, sizes = (join([getattr(f, part) for f in forms], at) for part in ("rows", "sizes"))
     return FoldedForm(forms[0].noted, rows, sizes, max(f.error for f in forms))
 
 
 @handles(torch.unbind, torch.Tensor.unbind)
 def unbind(x: FoldedForm, dim: int = 0) -> tuple[FoldedForm, ...]:
     """Slices along one dimension."""
-    return tuple(x.moved_by(lambda t, i=i: t.select(_of_columns(dim), i)) for i in range(x.shape[dim]))
+    at = _of_columns(dim, x.dim())
+    return tuple(x.moved_by(lambda t, i=i: t.select(at, i)) for i in range(x.shape[dim]))
 
 
 @handles(torch.flatten, torch.Tensor.flatten)
 def flatten(x: FoldedForm, start_dim: int = 0, end_dim: int = -1) -> FoldedForm:
     """Merge event dimensions."""
-    return x.moved_by(lambda t: t.flatten(_of_columns(start_dim), _of_columns(end_dim)))
+    first, last = (_of_columns(dim, x.dim()) for dim in (start_dim, end_dim))
+    return x.moved_by(lambda t: t.flatten(first, last))
 
 
 @handles(torch.unsqueeze, torch.Tensor.unsqueeze)
 def unsqueeze(x: FoldedForm, dim: int) -> FoldedForm:
     """Insert a dimension."""
-    return x.moved_by(lambda t: t.unsqueeze(_of_columns(dim)))
+    return x.moved_by(lambda t: t.unsqueeze(_of_columns(dim, x.dim() + 1)))
 
 
 @handles(torch.squeeze, torch.Tensor.squeeze)
 def squeeze(x: FoldedForm, dim: int) -> FoldedForm:
     """Remove a dimension of size one."""
-    return x.moved_by(lambda t: t.squeeze(_of_columns(dim)))
+    return x.moved_by(lambda t: t.squeeze(_of_columns(dim, x.dim())))
 
 
 @handles(torch.atan2, torch.arctan2, torch.Tensor.atan2, torch.Tensor.arctan2)

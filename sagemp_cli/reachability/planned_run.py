@@ -90,12 +90,12 @@ def planned_run(
     center, reach = (side.reshape(-1, n).numpy() for side in (start.center, start.radius))
     generators = reach[:, :, None] * np.eye(n)
     lowers, uppers, found = [low], [high], PlannedRun(Tube(start.lower, start.upper), [], [], [], [])
-    records, kept_steps, again = [], [], 0
+    kept_steps, again = [], 0
     for k in range(steps):
         known = None if hints is None else hints[k]
         states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
         after, control = plan.step(k, states)
-        records.append(states.records)
+        found.bands.append([(r.name, Band(*map(in_batch, r.band))) for r in states.records])
         if watch and control is not None:
             found.controls.append(tuple(map(in_batch, states.bounds(control))))
         if keep_steps:
@@ -120,7 +120,6 @@ def planned_run(
             bad = ~np.isfinite(reach).all(-1)
             lowers[-1][bad], uppers[-1][bad] = -math.inf, math.inf
             center[bad], generators[bad], reach[bad] = math.nan, math.nan, math.nan
-    found.bands += [[(r.name, Band(*map(in_batch, r.band))) for r in step] for step in records]
     found.steps += forms_of(kept_steps, batch, disturbance.radius)
     found.tube = Tube(*(in_batch(np.stack(side, axis=1)) for side in (lowers, uppers)))
     return found
@@ -130,7 +129,7 @@ class _Prepared:
     """A plan with its numbers."""
 
     def __init__(self, loop: FoldableLoop, steps: int, batch: torch.Size, n: int, disturbance: Box) -> None:
-        given = torch.stack([loop.given(k) for k in range(steps)])
+        given = torch.stack([loop.given(k) for k in range(steps)]).to(torch.float64)
         own = given.shape[1 : given.dim() - loop.given_dim]
         shape = given.shape[1 + len(own) :]
         if len(own) > len(batch) or np.broadcast_shapes(own, batch) != batch:

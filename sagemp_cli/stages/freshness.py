@@ -74,7 +74,9 @@ def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileStat
     except ArtifactError as e:
         return FileState(stage, path, Freshness.DAMAGED, str(e).removeprefix(f"{path}: "))
     why = (
-        _config_change(stage, header, context) or _input_change(stage, header, context, before) or _file_change(header, context)
+        _config_change(stage, header, context)
+        or _input_change(stage, header, context, before)
+        or _file_change(header, context)
     )
     return FileState(stage, path, Freshness.STALE if why else Freshness.FRESH, why, header, sha256_of(path))
 

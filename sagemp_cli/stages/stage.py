@@ -82,7 +82,6 @@ class Stage:
         return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}").run(context)
 
 
-
 def _has_demonstrations(config: Mapping[str, Any]) -> bool:
     """Whether the planner learns from an expert; one of a file or one that teaches itself does not."""
     return getattr(target_class(config["planner"], "planner"), "learns_from", None) == "demonstrations"

@@ -1,8 +1,9 @@
 """The kinds of artifact: one record class each. ``docs/artifacts.md`` describes them in prose.
 
 Dimensions: ``count`` demonstrations or references, ``K`` steps, ``n`` states, ``m`` controls, ``cells`` of all
-partitions together, ``rollouts`` simulated runs, ``bins`` of a histogram. Arrays are time first after the count. Numbers are finite but
-where ``finite=False`` says otherwise: bounds that overflowed are infinite, figures that were not measured NaN.
+partitions together, ``rollouts`` simulated runs, ``bins`` of a histogram. Arrays are time first after the count.
+Numbers are finite but where ``finite=False`` says otherwise: bounds that overflowed are infinite, figures that were
+not measured NaN.
 """
 
 from __future__ import annotations

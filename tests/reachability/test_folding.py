@@ -7,8 +7,13 @@ from typing import ClassVar
 import pytest
 import torch
 
-from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable, plan_of
+from sagemp_cli.sets import Box
+
+from .propagator_cases import DISTURBANCE, START, line, unicycle_loop
 
 
 @dataclass(frozen=True)
@@ -111,3 +116,61 @@ def test_an_operation_that_nothing_is_known_of_is_refused_by_name():
 
 def test_a_loop_says_itself_that_it_can_be_folded():
     assert isinstance(Step(None), FoldableLoop) and not isinstance(object(), FoldableLoop)
+
+
+class Windy(ClosedLoop):
+    """A closed loop with a step of its own, which what it inherits knows nothing of."""
+
+    def step(self, k, x, w):
+        return super().step(k, x, w) + 0.3 * k
+
+
+def test_a_loop_that_overrides_its_step_is_bounded_as_it_steps():
+    loop, start, disturbance = unicycle_loop(line(0.1)), START, DISTURBANCE
+    windy = Windy(loop.dynamics, loop.tracker, loop.references)
+    with torch.no_grad():
+        tube = Affine().propagate(windy, start, disturbance)
+        x = start.center
+        for k in range(windy.horizon):
+            x = windy.step(k, x, disturbance.center)
+            assert bool(((tube.lower[k + 1] <= x) & (x <= tube.upper[k + 1])).all())
+    with pytest.raises(UsageError, match="Windy has a step of its own"):
+        Affine().prove(windy, start, disturbance)
+
+
+class Sum:
+    """A step that counts its dimensions from the front."""
+
+    horizon, state_dim, given_dim = 5, 2, 0
+
+    def given(self, k):
+        return torch.zeros((), dtype=torch.float64)
+
+    def step_given(self, given, x, w):
+        return 0.5 * x + x.sum(0) + w, None
+
+    def step(self, k, x, w):
+        return self.step_given(self.given(k), x, w)[0]
+
+
+def test_a_step_that_counts_dimensions_from_the_front_is_not_folded():
+    start = Box.around([1.0, 2.0], [0.1, 0.1])
+    loop = Sum()
+    with torch.no_grad():
+        tube = Affine().propagate(loop, start, Box.around([0.0, 0.0], [0.1, 0.1]))
+        x = start.center
+        for k in range(loop.horizon):
+            x = loop.step(k, x, torch.zeros(2, dtype=torch.float64))
+            assert bool(((tube.lower[k + 1] <= x) & (x <= tube.upper[k + 1])).all())
+
+
+def test_a_scaled_constant_of_less_precision_is_taken_exactly():
+    number = torch.tensor(0.1, dtype=torch.float32)
+
+    class Drift(Sum):
+        def step_given(self, given, x, w):
+            return torch.add(x, number, alpha=0.1) + w, None
+
+    tube = Affine().propagate(Drift(), Box.around([1.0, 1.0], [0.0, 0.0]), Box.around([0.0, 0.0], [0.0, 0.0]))
+    exact = 1 + 5 * Fraction(0.1) * Fraction(float(number))
+    assert Fraction(float(tube.lower[5, 0])) <= exact <= Fraction(float(tube.upper[5, 0]))

@@ -28,7 +28,7 @@ def test_all_figures_of_an_experiment_are_made_from_its_artifacts_alone(toy_root
     shutil.copytree(toy_folder, root / "toy", ignore=shutil.ignore_patterns("*.png", "planner.h5"))
     before = {p.name: p.read_bytes() for p in (root / "toy").iterdir()}
     assert main([str(root)]) == 0
-    names = ["demonstrations", "tracker", "certificate", "library", "rollouts", "safety"]  # the planner was not run here
+    names = ["demonstrations", "tracker", "certificate", "library", "rollouts", "safety"]  # no planner was run
     paths = [root / "figures" / f"toy_{name}.png" for name in names]
     assert capsys.readouterr().out.split() == [str(p) for p in paths]
     assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths)
