@@ -91,15 +91,15 @@ def _fields(record: Any, prefix: str) -> list[dict[str, str]]:
                 text = str(value)
                 row["holds"] = text if len(text) <= 60 else f"{text[:57]}..."
             case "weights":
-                count = sum(int(np.size(w)) for w in value.values())
-                row["holds"] = f"{len(value)} arrays, {count} numbers"
+                count = sum(int(np.size(w)) for w in (value or {}).values())
+                row["holds"] = "-" if value is None else f"{len(value)} arrays, {count} numbers"
             case "group" if meta["many"]:
                 row["holds"] = f"{len(value)} groups"
         rows.append(row)
         if meta["form"] == "weights":
             rows += [
                 {"name": f"{name}/{k}", "holds": f"{w.dtype} {tuple(w.shape)}", "dims": "", "units": "", "doc": ""}
-                for k, w in value.items()
+                for k, w in (value or {}).items()
             ]
         if meta["form"] == "group":
             items = value if meta["many"] else () if value is None else (value,)
