@@ -17,6 +17,8 @@ MOST_WAYPOINTS = 100
 LONGEST_ANSWER = 100_000
 """Characters; nothing longer is looked at."""
 
+DEEPEST = 100
+"""Brackets open at a time, at most."""
 _ON_THE_EDGE = 1e-6
 _REFUSALS = re.compile(r"\b(can(?:no|['’])t|unable|won['’]t|will not|not able|sorry|refuse|apolog)", re.IGNORECASE)
 
@@ -80,6 +82,11 @@ def _refuse_outside(points: NDArray[np.float64], low: NDArray, high: NDArray, wh
 
 def _listed(text: str) -> list[Any]:
     """The first list of the text's JSON that can be waypoints."""
+    depth = 0
+    for bracket in re.findall(r"[\[{\]}]", text):
+        depth = depth + 1 if bracket in "[{" else max(0, depth - 1)
+        if depth > DEEPEST:  # before the decoder sees it: it would start again at each of them
+            raise AnswerError("the answer's JSON is nested too deep")
     decoder, opens, seen, position = json.JSONDecoder(), re.compile(r"[\[{]"), [], 0
     while (opening := opens.search(text, position)) is not None:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 
 import pytest
 import torch
@@ -63,6 +64,16 @@ def test_an_answer_that_is_no_use_is_refused_in_one_line(answer, message):
     with pytest.raises(AnswerError, match=re.escape(message)) as caught:
         waypoints_of(answer, FRAME)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 250
+
+
+def test_brackets_without_end_are_refused_at_once_whatever_the_recursion_limit():
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(200_000)
+    try:
+        with pytest.raises(AnswerError, match="nested too deep"):
+            waypoints_of("[" * 50_000, FRAME)
+    finally:
+        sys.setrecursionlimit(limit)
 
 
 def test_a_place_in_the_image_but_outside_the_workspace_is_refused():
