@@ -119,14 +119,17 @@ def multiply(a: Any, b: Any) -> PlainForm:
     if not isinstance(b, PlainForm):
         return PlainForm(a.frame, a.center * b, a.coefficients * b)
     size = max(a.coefficients.shape[0], b.coefficients.shape[0])
-    x, y = (PlainForm(f.frame, f.center, _padded(f.coefficients, size)) for f in (a, b))
+    shape = torch.broadcast_shapes(a.shape, b.shape)
+    x, y = (
+        PlainForm(f.frame, f.center.expand(shape), _padded(f.coefficients, size).expand(size, *shape)) for f in (a, b)
+    )
     rows_x, rows_y = x.spread(), y.spread()
     ratio = torch.sqrt(rows_y.abs().sum(-1) / rows_x.abs().sum(-1))[..., None]
     scaled_x, scaled_y = rows_x * ratio, rows_y / ratio
-    high = 0.25 * (scaled_x + scaled_y).abs().sum(-1).square().reshape(a.shape)
-    low = 0.25 * (scaled_x - scaled_y).abs().sum(-1).square().reshape(a.shape)
-    coefficients = a.center * y.coefficients + b.center * x.coefficients
-    return x.with_fresh(a.center * b.center + 0.5 * (high - low), coefficients, 0.5 * (high + low))
+    high = 0.25 * (scaled_x + scaled_y).abs().sum(-1).square().reshape(shape)
+    low = 0.25 * (scaled_x - scaled_y).abs().sum(-1).square().reshape(shape)
+    coefficients = x.center * y.coefficients + y.center * x.coefficients
+    return x.with_fresh(x.center * y.center + 0.5 * (high - low), coefficients, 0.5 * (high + low))
 
 
 @handles(torch.div, torch.Tensor.__truediv__)
@@ -147,6 +150,16 @@ def stack(values: Sequence[PlainForm], dim: int = -1) -> PlainForm:
         values[0].frame,
         torch.stack([v.center for v in values], dim),
         torch.stack([_padded(v.coefficients, size) for v in values], dim),
+    )
+
+
+@handles(torch.cat)
+def cat(values: Sequence[PlainForm], dim: int = -1) -> PlainForm:
+    size = max(v.coefficients.shape[0] for v in values)
+    return PlainForm(
+        values[0].frame,
+        torch.cat([v.center for v in values], dim),
+        torch.cat([_padded(v.coefficients, size) for v in values], dim),
     )
 
 

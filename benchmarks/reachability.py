@@ -208,9 +208,7 @@ def learned(quick: bool) -> list[Figure]:
     model, errors = learned_unicycle()
     loop = ClosedLoop(model, case.tracker, case.references[0])
     cells = cells_of(case, 4)
-    figures = [
-        Figure("root mean square error of the learned derivative", float((errors.rms**2).mean() ** 0.5))
-    ]
+    figures = [Figure("root mean square error of the learned derivative", float((errors.rms**2).mean() ** 0.5))]
     for symbols in (None, 400):
         seconds, tube = timed(lambda s=symbols: Affine(symbols=s).propagate(loop, cells, case.disturbance), 1)
         label = "all symbols" if symbols is None else f"{symbols} symbols"
