@@ -26,7 +26,7 @@ import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the 
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine_form import AffineForm, Hints, StepFrame
-from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable, speaks_for_itself
+from sagemp_cli.reachability.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
 from sagemp_cli.reachability.planned_run import planned_run
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.recording import Recording

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
-from sagemp_cli.reachability.folding import NotFoldable
+from sagemp_cli.reachability.foldable_loop import NotFoldable
 from sagemp_cli.reachability.partition import parse_partitions, partition, uncertain_dimensions
 from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.reachability.tracing.probing import Step, agree, probe, reproduced

@@ -2,7 +2,8 @@
 
 Most operations of a step are linear: errors of a lookahead, layers, scales, ``x + dt (...)``. Evaluated on a set, each
 costs several tensor operations on a few numbers. So a loop whose steps differ in given numbers only
-(:class:`FoldableLoop`) is evaluated once on :class:`FoldedForm`, values that are known as fixed combinations of the
+(:class:`~sagemp_cli.reachability.foldable_loop.FoldableLoop`)
+is evaluated once on :class:`FoldedForm`, values that are known as fixed combinations of the
 step's *basic* values: 1, the given numbers, the states, the disturbances, and the results of the nonlinear operations
 before. What comes out, the :class:`Plan`, says which nonlinear operations there are and which combinations go into
 them; :mod:`sagemp_cli.reachability.planned_run` evaluates them.
@@ -16,50 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.foldable_loop import FoldableLoop, NotFoldable
 from sagemp_cli.reachability.form import Form, Operation, registers
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
-
-
-class NotFoldable(Exception):
-    """A step does something that needs the sets themselves; it has to be evaluated operation by operation."""
-
-
-@runtime_checkable
-class FoldableLoop(Protocol):
-    """A loop whose steps are the same but for some numbers.
-
-    ``step_given`` is evaluated once for all sets, so it must not look at values, and its dimensions count from the end:
-    there may be any batch in front.
-
-    Attributes:
-        given_dim: dimensions of these, without batch.
-    """
-
-    given_dim: int
-
-    def given(self, k: int) -> Tensor:
-        """The numbers of step k, ``(..., any shape)``."""
-
-    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The next state ``(..., n)`` and, where there is one, the control."""
-
-
-def speaks_for_itself(loop: Any) -> bool:
-    """Whether a loop's ``step_given`` says what its ``step`` does: whether none of its classes came later with another
-    ``step`` or ``control``.
-    """
-    kinds = type(loop).__mro__
-    last = next((i for i, kind in enumerate(kinds) if "step_given" in vars(kind)), None)
-    if last is None or any(name in getattr(loop, "__dict__", {}) for name in ("step", "control")):
-        return False
-    return not any(name in vars(kind) for kind in kinds[:last] for name in ("step", "control"))
 
 
 class Combination(NamedTuple):

@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.affine_form import SAFETY, AffineForm, Hints
-from sagemp_cli.reachability.folding import Combination, FoldableLoop, Node, NotFoldable, Plan, plan_of
+from sagemp_cli.reachability.foldable_loop import FoldableLoop, NotFoldable
+from sagemp_cli.reachability.folding import Combination, Node, Plan, plan_of
 from sagemp_cli.reachability.planned_operations import (
     EVALUATE,
     Bounded,

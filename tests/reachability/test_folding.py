@@ -10,7 +10,8 @@ import torch
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.folding import FoldableLoop, NotFoldable, plan_of
+from sagemp_cli.reachability.foldable_loop import FoldableLoop, NotFoldable
+from sagemp_cli.reachability.folding import plan_of
 from sagemp_cli.sets import Box
 
 from .propagator_cases import DISTURBANCE, START, line, unicycle_loop
