@@ -93,11 +93,23 @@ class States:
             rows[..., count + own :] = 0.0
         return rows
 
+    def radius(self, coefficients: Array) -> Array:
+        """Sums of the magnitudes of a vector's coefficients over all symbols, ``(B, e)``, but for rounding.
+
+        In blocks of symbols that stay in the processor's cache.
+        """
+        n, count = self.generators.shape[-2:]
+        of_state, own = coefficients[..., :n], coefficients[..., n:]
+        radius = np.abs(own) @ self.own_radius[: own.shape[-1]]
+        block = max(_BLOCK // (len(self.generators) * coefficients.shape[-2]), 64)
+        for first in range(0, count, block):
+            part = of_state @ self.generators[..., first : first + block]
+            radius = radius + np.abs(part, out=part) @ _ONES[: part.shape[-1]]
+        return radius
+
     def bounds(self, x: Value) -> tuple[Array, Array]:
         """Lower and upper bounds, rounding included."""
-        rows = self.rows(x.coefficients)
-        radius = np.add.reduce(np.abs(rows, out=rows), axis=-1)
-        radius += x.both[1] * ((x.error + self.sum_error) * SAFETY)
+        radius = self.radius(x.coefficients) + x.both[1] * ((x.error + self.sum_error) * SAFETY)
         return x.both[0] - radius, x.both[0] + radius
 
     def narrowed(self, lower: Array, upper: Array, operation: int) -> tuple[Array, Array]:
@@ -174,24 +186,19 @@ def _product(node: Node, states: States, operands: Value) -> Value:
     :mod:`~sagemp_cli.reachability.affine_operations`, which this is for arrays.
     """
     size, error = node.size, operands.error
-    rows = states.rows(operands.coefficients)
-    # Rounding of the rows, of their sums, and of scaling (2 more units each) is within twice the usual slack.
+    gx, gy = operands.coefficients[:, :size], operands.coefficients[:, size:]
+    # Rounding of the sums, and of scaling (3 more units) is within twice the usual slack.
     slack = operands.both[1] * (2 * (error + states.sum_error) * SAFETY)
-    radius = np.add.reduce(np.abs(rows), axis=-1) + slack
+    radius = states.radius(operands.coefficients) + slack
     radius_x, radius_y = radius[:, :size], radius[:, size:]
     ratio = np.sqrt(radius_y / radius_x)
-    x, y = rows[:, :size], rows[:, size:]
-    x *= ratio[..., None]
-    y /= ratio[..., None]
+    x, y = gx * ratio[..., None], gy / ratio[..., None]
     doubt = (slack[:, :size] * ratio + slack[:, size:] / ratio) * SAFETY
-    both = x + y
-    plus = np.add.reduce(np.abs(both, out=both), axis=-1) + doubt
-    np.subtract(x, y, out=both)
-    minus = np.add.reduce(np.abs(both, out=both), axis=-1) + doubt
+    ends = states.radius(np.concatenate([x + y, x - y], axis=-2))
+    plus, minus = ends[:, :size] + doubt, ends[:, size:] + doubt
     high, low = plus * plus * 0.25, minus * minus * 0.25
     middle, half = 0.5 * (high - low), 0.5 * (high + low)
     (c, mx), (d, my) = operands.both[..., :size], operands.both[..., size:]
-    gx, gy = operands.coefficients[:, :size], operands.coefficients[:, size:]
     magnitude = np.abs(c) * my + np.abs(d) * mx + half + TINY  # |c| my >= |c d|, and half >= |middle|
     center, coefficients = c * d + middle, c[..., None] * gy + d[..., None] * gx
     record = Record(
@@ -221,6 +228,9 @@ def _quotient(node: Node, states: States, operands: Value) -> Value:
     return Value(product.both + np.array([q, np.abs(q)]), product.coefficients, product.error + 2 * UNIT)
 
 
+_BLOCK = 2**16
+"""Entries of an array that stays in the cache."""
+_ONES = np.ones(_BLOCK)
 _ONE = np.ones(1)
 EVALUATE: dict[str, Callable[[Node, States, Value], Value]] = {
     "scalar": _scalar,
