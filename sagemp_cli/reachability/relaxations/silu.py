@@ -33,8 +33,9 @@ def _value(x: Tensor) -> Tensor:
 
 
 def _derivative(x: Tensor) -> Tensor:
-    s = _logistic(x)
-    return s + x * s * _logistic(-x)
+    q = torch.exp(-x.abs())
+    d = 1.0 + q
+    return (torch.where(x >= 0, torch.ones_like(q), q) + x * (q / d)) / d
 
 
 def _solve(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
@@ -42,15 +43,20 @@ def _solve(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
     left, right = start, end
     at_left, at_right = _derivative(left) - slope, _derivative(right) - slope
     beyond, nearest = at_left * at_right > 0, torch.where(at_left.abs() < at_right.abs(), left, right)
-    t = left
-    for _ in range(10):
+    t, near, before = left, 1e-6 * (at_right - at_left).abs(), torch.zeros_like(left, dtype=torch.bool)
+    for i in range(10):
         drop = at_right - at_left
         t = torch.where(drop == 0, left, right - at_right * (right - left) / drop)
         t = torch.minimum(torch.fmax(t, left), right)
         at = _derivative(t) - slope
+        if bool((beyond | (at.abs() <= near)).all()):
+            break
+        # The end that stays for the second time counts half.
         same = (at > 0) == (at_right > 0)
-        left, at_left = torch.where(same, left, t), torch.where(same, 0.5 * at_left, at)
-        right, at_right = torch.where(same, t, right), torch.where(same, at, 0.5 * at_right)
+        stays = torch.where(same == before, 0.5, 1.0) if i else 1.0
+        left, at_left = torch.where(same, left, t), torch.where(same, at_left * stays, at)
+        right, at_right = torch.where(same, t, right), torch.where(same, at, at_right * stays)
+        before = same
     return torch.where(beyond, nearest, t)
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sagemp_cli.reachability.relaxations import clamp, leaky_relu, sine, tanh
+from sagemp_cli.reachability.relaxations import clamp, leaky_relu, silu, sine, tanh
 
 from .relaxation_cases import CASES
 
@@ -136,3 +136,13 @@ def test_figures_known_in_closed_form():
     assert float(next(c for c in CASES if c.name == "power 3").band(-one, one).radius) == pytest.approx(0.25, rel=1e-3)
     assert float(sine.sine_band(-500 * one, 500 * one).radius) == pytest.approx(1.0, abs=5e-3)
     assert float(sine.sine_band(-1e-1 * one, 1e-1 * one).radius) == pytest.approx(1e-3 / 24, rel=1e-2)
+
+
+def test_the_derivative_of_silu_at_the_point_found_is_the_slope_asked_for():
+    generator = torch.Generator().manual_seed(7)
+    start, end = (2.0 * torch.rand(2, 200, dtype=torch.float64, generator=generator)).sort(dim=0).values
+    at_start, at_end = silu.CURVE.derivative(start), silu.CURVE.derivative(end)
+    slope = at_start + (at_end - at_start) * torch.rand(200, dtype=torch.float64, generator=generator)
+    t = next(piece for piece in silu.CURVE.pieces if piece.convex).touch(slope, start, end)
+    assert bool((start <= t).all()) and bool((t <= end).all())
+    assert bool(((silu.CURVE.derivative(t) - slope).abs() <= 1e-6 * (at_end - at_start) + 1e-15).all())
