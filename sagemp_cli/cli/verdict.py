@@ -61,6 +61,8 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
         for c in data["counterexamples"]
     ]
     lines.append(f"certificate {data['certificate']}")
+    if data["verdict"] == "VERIFIED" and not data["checkable"]:
+        lines.append(f"  nobody else can check it: propagator '{data['propagator']}' records no relaxations, 'affine' does")
     if data["figure"]:
         lines.append(f"figure      {data['figure']}")
     return lines
@@ -110,6 +112,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "horizon": int(tubes.references.shape[1] - 1),
         "propagator": tubes.propagator,
         "rigorous": tubes.rigorous,
+        "checkable": tubes.relaxations is not None,
         "cells": len(tubes.cell_reference),
         "certified": sum(v == "SAFE" for v in tubes.verdict),
         "references": references,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import time
 
 import pytest
 
-from sagemp_cli.errors import EXIT_INTERRUPTED
+from sagemp_cli.errors import EXIT_INTERRUPTED, EXIT_UNKNOWN
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.sets import Tube
 
@@ -21,7 +22,18 @@ def test_verify_after_the_pipeline_prints_the_proof_of_its_certificate(sagemp, t
     found = json.loads(result.stdout)
     assert result.exit_code == 0
     assert (found["verdict"], found["from_file"], found["rigorous"]) == ("VERIFIED", True, True)
-    assert found["references"][0]["clearance"] > 0
+    assert found["references"][0]["clearance"] > 0 and found["checkable"]
+
+
+def test_verify_says_that_a_tube_without_recorded_relaxations_cannot_be_checked(sagemp, toy_folder, tmp_path):
+    folder = tmp_path / toy_folder.name
+    folder.mkdir()
+    for name in ("demonstrations.h5", "planner.h5", "tracker.h5"):
+        shutil.copy(toy_folder / name, folder)
+    shown = sagemp("verify", "effort=toy", f"artifacts={tmp_path}", "--partitions", "4", "propagator=crown").stdout
+    assert shown.startswith("VERIFIED")
+    assert "nobody else can check it: propagator 'crown' records no relaxations, 'affine' does" in shown
+    assert sagemp("check", folder / "certificate.h5").exit_code == EXIT_UNKNOWN
 
 
 def test_run_after_the_pipeline_has_nothing_to_do(sagemp, toy_root):
