@@ -1,178 +1,123 @@
-"""Affine arithmetic in plain float64, for the price of rigour: the propagator without its account of rounding.
+"""Affine arithmetic in plain float64, for the price of rigour: :mod:`sagemp_cli.reachability.planned_run` on the same
+plan, with the same sums over generators and the same reduction, but without its account of rounding.
 
-It knows the operations of the benchmark's loops only, and its tubes prove nothing.
+Its tubes prove nothing.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-import sagemp_cli.reachability.relaxed_operations  # noqa: F401  (registers the relaxations)
-from sagemp_cli.reachability.form import Form, Operation, registers
-from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.foldable_loop import FoldableLoop
+from sagemp_cli.reachability.folding import Combination, Node, Plan, plan_of
+from sagemp_cli.reachability.planned_operations import States, diagonal
+from sagemp_cli.reachability.reduction import reduce_arrays
+from sagemp_cli.reachability.relaxations.band import TINY
 from sagemp_cli.sets import Box, Tube
 
-
-class PlainForm(Form):
-    """``center + sum_i coefficients_i z_i``; variables first, as in the propagator's form."""
-
-    __slots__ = ("center", "coefficients", "frame")
-
-    def __init__(self, frame: _Frame, center: Tensor, coefficients: Tensor) -> None:
-        self.frame, self.center, self.coefficients = frame, center, coefficients
-
-    @property
-    def shape(self) -> torch.Size:
-        return self.center.shape
-
-    def dim(self) -> int:
-        return self.center.dim()
-
-    def _rows(self) -> Tensor:
-        batch = self.frame.batch
-        return self.coefficients.reshape(self.coefficients.shape[0], *batch, -1).movedim(0, -1)
-
-    def spread(self) -> Tensor:
-        """Rows in terms of all symbols, ``(*batch, events, symbols)``."""
-        rows, generators = self._rows(), self.frame.generators
-        n = generators.shape[-2]
-        own = rows[..., n:] * self.frame.own_radius[: rows.shape[-1] - n]
-        return torch.cat([rows[..., :n] @ generators, own], dim=-1)
-
-    def radius(self) -> Tensor:
-        rows, generators = self._rows(), self.frame.generators
-        n = generators.shape[-2]
-        own = (rows[..., n:].abs() * self.frame.own_radius[: rows.shape[-1] - n]).sum(-1)
-        return ((rows[..., :n] @ generators).abs().sum(-1) + own).reshape(self.shape)
-
-    def relaxed(self, name: str, operation: Operation, *parameters: Any) -> PlainForm:
-        radius = self.radius()
-        slope, offset, error = operation.band(self.center - radius, self.center + radius, *parameters)
-        return self.with_fresh(self.center * slope + offset, self.coefficients * slope, error)
-
-    def with_fresh(self, center: Tensor, coefficients: Tensor, radius: Tensor) -> PlainForm:
-        """One new variable per entry."""
-        frame, batch = self.frame, len(self.frame.batch)
-        events = math.prod(center.shape[batch:])
-        fresh = center.new_zeros(frame.size - coefficients.shape[0] + events, *center.shape)
-        if center.dim() == batch:
-            fresh[-1] = radius
-        else:
-            fresh[-events:].flatten(batch + 1).diagonal(dim1=0, dim2=-1).copy_(radius.flatten(batch))
-        frame.size += events
-        return PlainForm(frame, center, torch.cat([coefficients, fresh]))
-
-    def __getitem__(self, index: Any) -> PlainForm:
-        index = index if isinstance(index, tuple) else (index,)
-        return PlainForm(self.frame, self.center[index], self.coefficients[(slice(None), *index)])
+Array = np.ndarray
+Form = tuple[Array, Array]
+"""Centre ``(B, e)`` and coefficients ``(B, e, variables)``."""
 
 
-class _Frame:
-    def __init__(self, generators: Tensor, disturbance_radius: Tensor) -> None:
-        self.generators, self.batch = generators, generators.shape[:-2]
-        self.own_radius = torch.cat([disturbance_radius, disturbance_radius.new_ones(256)])
-        self.size = generators.shape[-2] + disturbance_radius.shape[-1]
+@dataclass(frozen=True)
+class _Fold:
+    """A combination with its numbers: constants per step, and matrices of the state, of w and of results;
+    whether the former are not zero."""
 
-    def inputs(self, center: Tensor, w_center: Tensor) -> tuple[PlainForm, PlainForm]:
-        n, d = center.shape[-1], w_center.shape[-1]
-        eye = torch.eye(n + d, dtype=torch.float64).reshape(n + d, *[1] * len(self.batch), n + d)
-        eye = eye.expand(n + d, *self.batch, n + d)
-        return (
-            PlainForm(self, center, eye[..., :n]),
-            PlainForm(self, w_center.expand(*self.batch, d), eye[..., n:]),
+    constants: Array
+    of_state: Array
+    of_inputs: Array
+    of_results: tuple[tuple[int, Array], ...]
+    direct: bool
+
+    @staticmethod
+    def of(plan: Plan, combination: Combination, given: Tensor, center: Tensor) -> _Fold:
+        one, numbers, state, w, *results = plan.split(combination.matrix.detach())
+        linear = torch.nn.functional.linear
+        constants = one[:, 0] + linear(given, numbers) + linear(center, w)
+        return _Fold(
+            constants.numpy(),
+            state.mT.contiguous().numpy(),
+            torch.cat([state, w], dim=-1).numpy(),
+            tuple((i, m.numpy()) for i, m in reversed([*enumerate(results)]) if m.any()),
+            bool(state.any() or w.any()),
         )
 
-
-PlainForm.handlers = {}
-handles = registers(PlainForm.handlers)
-
-
-def _padded(coefficients: Tensor, size: int) -> Tensor:
-    gap = size - coefficients.shape[0]
-    return coefficients if gap == 0 else torch.cat([coefficients, coefficients.new_zeros(gap, *coefficients.shape[1:])])
-
-
-@handles(torch.add)
-def add(a: Any, b: Any) -> PlainForm:
-    if not isinstance(a, PlainForm):
-        a, b = b, a
-    if not isinstance(b, PlainForm):
-        return PlainForm(a.frame, a.center + b, a.coefficients)
-    size = max(a.coefficients.shape[0], b.coefficients.shape[0])
-    return PlainForm(a.frame, a.center + b.center, _padded(a.coefficients, size) + _padded(b.coefficients, size))
+    def __call__(self, k: int, states: States, results: Sequence[Form]) -> Form:
+        center, coefficients = self.constants[k] + states.both[0] @ self.of_state, self.of_inputs
+        for i, matrix in self.of_results:  # the latest first, which has most variables
+            center = center + results[i][0] @ matrix.T
+            part = matrix @ results[i][1]
+            if coefficients is self.of_inputs:
+                coefficients = part
+            else:
+                coefficients[..., : part.shape[-1]] += part
+        if coefficients is not self.of_inputs and self.direct:
+            coefficients[..., : self.of_inputs.shape[-1]] += self.of_inputs
+        return center, coefficients if coefficients.ndim == 3 else coefficients[None]
 
 
-@handles(torch.neg)
-def negate(a: PlainForm) -> PlainForm:
-    return PlainForm(a.frame, -a.center, -a.coefficients)
+def _with_fresh(states: States, center: Array, coefficients: Array, radius: Array) -> Form:
+    """One new variable per entry."""
+    size = radius.shape[-1]
+    out = np.zeros((len(center), size, states.size + size))
+    out[..., : coefficients.shape[-1]] = coefficients
+    diagonal(out, states.size)[...] = radius
+    states.size += size
+    return center, out
 
 
-@handles(torch.mul)
-def multiply(a: Any, b: Any) -> PlainForm:
-    if not isinstance(a, PlainForm):
-        a, b = b, a
-    if not isinstance(b, PlainForm):
-        return PlainForm(a.frame, a.center * b, a.coefficients * b)
-    size = max(a.coefficients.shape[0], b.coefficients.shape[0])
-    shape = torch.broadcast_shapes(a.shape, b.shape)
-    x, y = (
-        PlainForm(f.frame, f.center.expand(shape), _padded(f.coefficients, size).expand(size, *shape)) for f in (a, b)
-    )
-    rows_x, rows_y = x.spread(), y.spread()
-    ratio = torch.sqrt(rows_y.abs().sum(-1) / rows_x.abs().sum(-1))[..., None]
-    scaled_x, scaled_y = rows_x * ratio, rows_y / ratio
-    high = 0.25 * (scaled_x + scaled_y).abs().sum(-1).square().reshape(shape)
-    low = 0.25 * (scaled_x - scaled_y).abs().sum(-1).square().reshape(shape)
-    coefficients = x.center * y.coefficients + y.center * x.coefficients
-    return x.with_fresh(x.center * y.center + 0.5 * (high - low), coefficients, 0.5 * (high + low))
+def _scalar(node: Node, states: States, x: Form) -> Form:
+    radius, operation = states.radius(x[1]), node.operation
+    assert operation is not None
+    slope, offset, error = operation.band_of_arrays(x[0] - radius, x[0] + radius, *node.parameters)
+    return _with_fresh(states, x[0] * slope + offset, x[1] * slope[..., None], error)
 
 
-@handles(torch.div, torch.Tensor.__truediv__)
-def divide(a: PlainForm, b: float) -> PlainForm:
-    return PlainForm(a.frame, a.center / b, a.coefficients / b)
+def _product(node: Node, states: States, x: Form) -> Form:
+    size = node.size
+    (c, d), (gx, gy) = (np.split(side, [size], axis=1) for side in x)
+    radius = states.radius(x[1]) + TINY
+    ratio = np.sqrt(radius[:, size:] / radius[:, :size])[..., None]
+    a, b = gx * ratio, gy / ratio
+    ends = states.radius(np.concatenate([a + b, a - b], axis=1)) ** 2
+    high, low = 0.25 * ends[:, :size], 0.25 * ends[:, size:]
+    coefficients = c[..., None] * gy + d[..., None] * gx
+    return _with_fresh(states, c * d + 0.5 * (high - low), coefficients, 0.5 * (high + low))
 
 
-@handles(torch.nn.functional.linear)
-def linear(x: PlainForm, weight: Tensor, bias: Tensor | None = None) -> PlainForm:
-    apply = torch.nn.functional.linear
-    return PlainForm(x.frame, apply(x.center, weight, bias), apply(x.coefficients, weight))
+_EVALUATE = {"scalar": _scalar, "product": _product}
 
 
-@handles(torch.stack)
-def stack(values: Sequence[PlainForm], dim: int = -1) -> PlainForm:
-    size = max(v.coefficients.shape[0] for v in values)
-    return PlainForm(
-        values[0].frame,
-        torch.stack([v.center for v in values], dim),
-        torch.stack([_padded(v.coefficients, size) for v in values], dim),
-    )
-
-
-@handles(torch.cat)
-def cat(values: Sequence[PlainForm], dim: int = -1) -> PlainForm:
-    size = max(v.coefficients.shape[0] for v in values)
-    return PlainForm(
-        values[0].frame,
-        torch.cat([v.center for v in values], dim),
-        torch.cat([_padded(v.coefficients, size) for v in values], dim),
-    )
-
-
-@torch.inference_mode()
-def propagate(loop: Loop, start: Box, disturbance: Box) -> Tube:
-    """The tube in plain float64."""
-    center, generators = start.center, torch.diag_embed(start.radius)
-    lowers, uppers = [start.lower], [start.upper]
-    for k in range(loop.horizon):
-        frame = _Frame(generators, disturbance.radius)
-        after = loop.step(k, *frame.inputs(center, disturbance.center))
-        center, generators = after.center, after.spread()
-        radius = generators.abs().sum(-1)
+@torch.no_grad()
+@np.errstate(all="ignore")
+def propagate(loop: FoldableLoop, start: Box, disturbance: Box) -> Tube:
+    """The tube of a start box ``(B, n)`` in plain float64; of the operations that the benchmark's loops have."""
+    n, steps = start.dim, loop.horizon
+    given = torch.stack([loop.given(k) for k in range(steps)]).flatten(1).to(torch.float64)
+    plan = plan_of(loop, loop.given(0).shape, n, disturbance.dim)
+    nodes = [(node, _Fold.of(plan, node.operands, given, disturbance.center)) for node in plan.nodes]
+    state = _Fold.of(plan, plan.state, given, disturbance.center)
+    own_radius = np.concatenate([disturbance.radius.numpy(), np.ones(sum(node.size for node in plan.nodes))])
+    center, generators = start.center.numpy(), start.radius.numpy()[:, :, None] * np.eye(n)
+    lowers, uppers, again = [start.lower.numpy()], [start.upper.numpy()], 0
+    for k in range(steps):
+        states = States(center, center, generators, inputs=n + disturbance.dim, own_radius=own_radius)
+        results: list[Form] = []
+        for node, fold in nodes:
+            results.append(_EVALUATE[node.kind](node, states, fold(k, states, results)))
+        center, coefficients = state(k, states, results)
+        generators = states.rows(coefficients)
+        if generators.shape[-1] > again:
+            generators, _ = reduce_arrays(generators)
+            again = max(generators.shape[-1] * 5 // 4, generators.shape[-1] + 64)
+        radius = np.abs(generators).sum(-1)
         lowers.append(center - radius)
         uppers.append(center + radius)
-    return Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
+    return Tube(*(torch.from_numpy(np.stack(side, axis=1)) for side in (lowers, uppers)))

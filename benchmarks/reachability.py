@@ -316,7 +316,7 @@ def _rigour(name: str) -> list[Figure]:
             rigorous / plain,
             "x",
             2.0,
-            note="plain: the same bands and sums without bookkeeping of rounding; the bands keep their own margins",
+            note="plain: the same plan, sums and bands (which keep their own margins) without bookkeeping of rounding",
         ),
         Figure(f"{name}: what rounding adds to the width", float(excess[excess.isfinite()].max()), note="relative"),
     ]

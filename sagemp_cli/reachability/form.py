@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
 from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.relaxations.functions import on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
 
 Handler = Callable[..., Any]
@@ -34,6 +36,12 @@ class Operation(NamedTuple):
     lines: Callable[..., Lines]
     value_range: Callable[..., tuple[Tensor, Tensor]]
     arrays: bool = False
+
+    def band_of_arrays(self, lower: np.ndarray, upper: np.ndarray, *parameters: Any) -> Band:
+        """The band, of arrays and as arrays."""
+        if self.arrays:
+            return self.band(lower, upper, *parameters)
+        return on_tensors(lambda low, high: self.band(low, high, *parameters), lower, upper)
 
 
 class Form:

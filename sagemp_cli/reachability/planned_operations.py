@@ -14,7 +14,6 @@ import numpy as np
 from sagemp_cli.reachability.affine_form import SAFETY, Hints
 from sagemp_cli.reachability.folding import Node
 from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
-from sagemp_cli.reachability.relaxations.functions import on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
 
 Array = np.ndarray
@@ -149,12 +148,8 @@ class Bounded(NamedTuple):
 def _scalar(node: Node, states: States, x: Value) -> Value:
     """A function of one variable: its band over the operand's bounds."""
     lower, upper = states.narrowed(*states.bounds(x), len(states.records))
-    operation = node.operation
-    assert operation is not None
-    if operation.arrays:
-        band = operation.band(lower, upper, *node.parameters)
-    else:
-        band = on_tensors(lambda low, high: operation.band(low, high, *node.parameters), lower, upper)
+    assert node.operation is not None
+    band = node.operation.band_of_arrays(lower, upper, *node.parameters)
     return enclosed(node, states, Bounded(x, lower, upper, band))
 
 
