@@ -7,16 +7,16 @@ tests, and are meant to be above them.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ResourceError
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.propagator import Propagator
-from sagemp_cli.reachability.proving import CellProver
+from sagemp_cli.reachability.proving import CellProver, Chunk
 from sagemp_cli.sets import Box
 
 GIB = 2.0**30
@@ -49,16 +49,21 @@ def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
     With n states, d disturbances, M generators at the last step, E entries of nonlinear operations a step (H of the
     widest one) and v = n + d + E variables a step, in numbers of 8 bytes:
 
-    - kept: ``2 (K+1) n + 2 K m + 3 K E`` and a bit per generator and step, as many as if none were negligible;
+    - kept, with m columns of bounds beside the states: ``2 (K+1) n + 2 K m + 3 K E`` and a bit per generator and step,
+      as many as if none were negligible;
     - working, times :data:`HEAP`, of ``affine``: ``M (6 n + 3 H) + 12 v^2 + 2 kept``;
     - of ``crown`` and ``best``: as ``affine``, ``K (3 v^2 + 2 v n)`` for the steps and ``6 rows v`` for the sweep;
     - of ``interval``: ``40 v + 2 kept``.
     """
-    loop, propagator = ClosedLoop(prover.dynamics, prover.tracker, reference[None]), prover.propagator
-    n, d, m, steps = loop.state_dim, prover.disturbance.dim, prover.dynamics.control_dim, loop.horizon
-    box = Box(start.center[None], start.center[None])
-    recording = Affine().run(loop, box, prover.disturbance, horizon=1).recording()
-    entries, widest = recording.slope.shape[-1], max(recording.widths, default=1)
+    propagator, steps, n, d = prover.propagator, len(reference) - 1, start.dim, prover.disturbance.dim
+    shown = prover if hasattr(propagator, "prove") else dataclasses.replace(prover, propagator=Affine())
+    first = Chunk(
+        0, torch.zeros(1, dtype=torch.int64), reference[None, :2], Box(start.center[None], start.center[None])
+    )
+    found = shown.prove(first)
+    assert found.recording is not None
+    entries, widest = found.recording.slope.shape[-1], max(found.recording.widths, default=1)
+    m = found.control_lower.shape[-1]
     symbols = getattr(propagator, "symbols", None)
     v = n + d + entries
     generators = n + steps * v  # each step adds its disturbances, its relaxations and a column of rounding per state

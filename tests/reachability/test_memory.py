@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import ResourceError
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.auto_lirpa import AutoLirpa
+from sagemp_cli.reachability.deviation import Folded
 from sagemp_cli.reachability.memory import GIB, MOST_AT_ONCE, Footprint, cells_within, footprint
 from sagemp_cli.reachability.proving import CellProver, Chunk
 from sagemp_cli.sets import Box
@@ -69,6 +71,18 @@ START = Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.3, 0.0, 0.0])
 
 def needs(propagator, steps=50):
     return footprint(prover(propagator), torch.zeros(steps + 1, 4, dtype=torch.float64), START)
+
+
+def test_a_proof_about_a_learned_robots_model_counts_what_it_adds(learned_unicycle):
+    plain = dataclasses.replace(prover(Affine()), dynamics=learned_unicycle())
+    folded = dataclasses.replace(plain, propagator=Folded(Affine()))
+    reference = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(11, 4)
+    network, model = (footprint(p, reference, START) for p in (plain, folded))
+    assert model.kept > 1.1 * network.kept and model.working > 1.1 * network.working
+    cell = Box(START.lower[None], START.upper[None])
+    tubes = folded.prove(Chunk(0, torch.zeros(1, dtype=torch.int64), reference[None], cell))
+    kept = sum(array.nbytes for name, array in tubes.arrays().items() if not name.startswith("cell"))
+    assert 0.95 * kept <= model.kept <= 1.3 * kept
 
 
 def test_reduced_symbols_take_less_and_longer_horizons_more():
