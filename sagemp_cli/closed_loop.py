@@ -63,7 +63,7 @@ class ClosedLoop:
 
     def control(self, k: int, x: Tensor) -> Tensor:
         """``u_k = pi(e_k)`` with ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]`` (equation 6)."""
-        return self.tracker(self.window(k) - x[..., None, :])
+        return self.control_given(self.window(k), x)
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
@@ -77,8 +77,12 @@ class ClosedLoop:
 
     def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
         """The next state and the control ``u_k``, for a window."""
-        u = self.tracker(given - x[..., None, :])
+        u = self.control_given(given, x)
         return self.dynamics.step(x, u, w), u
+
+    def control_given(self, given: Tensor, x: Tensor) -> Tensor:
+        """``u_k``, for a window."""
+        return self.tracker(given - x[..., None, :])
 
     def folded(self) -> FoldedLoop:
         """The same loop with the tracker's first layer folded onto the fixed references."""

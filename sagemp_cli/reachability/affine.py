@@ -118,12 +118,13 @@ class Affine:
             horizon: steps; the loop's by default.
             keep_steps: keep every step's form, for a backward pass.
             hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
-            watch: bound the controls, of a :class:`~sagemp_cli.closed_loop.ClosedLoop`.
+            watch: bound what the loop's ``step_given`` gives beside the next state, usually the controls.
         """
         steps = loop.horizon if horizon is None else horizon
-        if watch and type(loop).step is not ClosedLoop.step:
-            raise UsageError(f"{type(loop).__name__} has a step of its own; controls are bounded of a ClosedLoop only")
-        if isinstance(loop, FoldableLoop) and speaks_for_itself(loop) and not torch.is_grad_enabled():
+        foldable = isinstance(loop, FoldableLoop) and speaks_for_itself(loop)
+        if watch and not foldable:
+            raise UsageError(f"{type(loop).__name__} has a step of its own, which does not say what its controls are")
+        if foldable and not torch.is_grad_enabled():
             wanted = {"symbols": self.symbols, "hints": hints, "keep_steps": keep_steps, "watch": watch}
             with contextlib.suppress(NotFoldable):
                 found = planned_run(loop, start, disturbance, steps, **wanted)
@@ -137,9 +138,8 @@ class Affine:
             frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
             x, w = frame.state(center), frame.disturbance(w_center)
             if watch:
-                u = loop.control(k, x)
-                controls.append(u.bounds())
-                after = loop.dynamics.step(x, u, w)
+                after, watched = loop.step_given(loop.given(k), x, w)
+                controls.append(watched.bounds())
             else:
                 after = loop.step(k, x, w)
             bands.append(frame.bands)

@@ -16,8 +16,8 @@ is of second order in the width of the set: small cells pay.
 from __future__ import annotations
 
 import dataclasses
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -26,9 +26,11 @@ from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import UsageError
 from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.affine_form import AffineForm
+from sagemp_cli.reachability.form import Form, Operation
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band
+from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.functions import functions_of
+from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.verification import Verification
 from sagemp_cli.sets import Box, Tube
 
@@ -61,7 +63,6 @@ class Folded:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
         return self.prove(loop, start, disturbance)[0]
 
-    @torch.no_grad()
     def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
         """Tube, bounds of controls and deviations, and what a certificate keeps of the proof.
 
@@ -70,22 +71,15 @@ class Folded:
         """
         if not isinstance(loop.dynamics, Learned):
             raise UsageError(f"only a learned robot deviates from a model, found {type(loop.dynamics).__name__}")
-        folding = _FoldingLoop(loop)
-        with torch.inference_mode():
-            run = self.affine.run(folding, start, disturbance)
-            lower, upper = (torch.stack(side, dim=-2) for side in zip(*folding.bounds, strict=True))
-            bad = torch.isnan(lower) | torch.isnan(upper)
-            lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
-        tube = Tube(run.tube.lower.clone(), run.tube.upper.clone())
-        return tube, lower.clone(), upper.clone(), run.recording()
+        return self.affine.prove(_FoldingLoop(loop), start, disturbance)
 
 
 @dataclass(frozen=True)
 class _FoldingLoop:
-    """A closed loop that folds as it steps, and notes the bounds of controls and deviations."""
+    """A closed loop that folds as it steps; what is watched are controls and deviations."""
 
     loop: ClosedLoop
-    bounds: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+    given_dim: ClassVar[int] = ClosedLoop.given_dim
 
     @property
     def horizon(self) -> int:
@@ -95,20 +89,37 @@ class _FoldingLoop:
     def state_dim(self) -> int:
         return self.loop.state_dim
 
-    def step(self, k: int, x: AffineForm, w: AffineForm) -> AffineForm:
+    def given(self, k: int) -> Tensor:
+        return self.loop.given(k)
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
         robot = self.loop.dynamics
-        u = self.loop.control(k, x)
+        u = self.loop.control_given(given, x)
         derivative, deviation = robot.compared(x, u)
-        self.bounds.append(tuple(torch.cat(s, dim=-1) for s in zip(u.bounds(), deviation.bounds(), strict=True)))
-        return robot.advance(x, derivative, w + folded(deviation))
+        return robot.advance(x, derivative, w + folded(deviation)), torch.cat([u, deviation], dim=-1)
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return self.step_given(self.given(k), x, w)[0]
 
 
-def folded(value: AffineForm) -> AffineForm:
+def folded(value: Form) -> Form:
     """A value of which only its bounds are kept."""
-    lower, upper = value.bounds()
+    return value.relaxed(FOLDED, _KEEPS_BOUNDS)
+
+
+def _band(lower: Any, upper: Any) -> Band:
+    """A constant band; of tensors or of arrays."""
     center = 0.5 * (lower + upper)
-    radius = torch.maximum(upper - center, center - lower) * (1.0 + 4 * UNIT) + TINY
-    return value.widened(FOLDED, Band(torch.zeros_like(center), center, radius))
+    radius = functions_of(lower).maximum(upper - center, center - lower) * (1.0 + 4 * UNIT) + TINY
+    return settled(0.0 * center, center, radius)
+
+
+def _lines(lower: Tensor, upper: Tensor) -> Lines:
+    level = torch.zeros_like(lower)
+    return Lines(level, lower, level, upper)
+
+
+_KEEPS_BOUNDS = Operation(_band, _lines, lambda lower, upper: (lower, upper), arrays=True)
 
 
 def split(found: Verification, controls: int) -> tuple[Verification, Tensor]:

@@ -28,7 +28,7 @@ class FoldableLoop(Protocol):
         """The numbers of step k, ``(..., any shape)``."""
 
     def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The next state ``(..., n)`` and, where there is one, the control."""
+        """The next state ``(..., n)`` and, where there is one, the control (or what else is to be bounded)."""
 
 
 def speaks_for_itself(loop: Any) -> bool:

@@ -8,8 +8,10 @@ import torch
 from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability import affine
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.deviation import Folded
+from sagemp_cli.reachability.foldable_loop import NotFoldable
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers.policy import Tracker
 
@@ -62,6 +64,21 @@ def test_tube_controls_and_deviations_enclose_the_analytical_loop(robot):
         widest = torch.maximum(widest, deviation.abs().amax(0))
     bound = torch.maximum(-lower, upper)[:, 2:]
     assert (bound[:, 0] < 1.2 * widest[:, 0] + 0.02 * W.upper[0]).all()  # the drift, and little more
+
+
+def test_on_arrays_the_proof_is_that_on_tensors(robot, monkeypatch):
+    def refuse(*_, **__):
+        raise NotFoldable
+
+    loop = loop_of(robot)
+    tube, *others, record = Folded(Affine()).prove(loop, START, W)
+    monkeypatch.setattr(affine, "planned_run", refuse)
+    slow, *slow_others, slow_record = Folded(Affine()).prove(loop, START, W)
+    for mine, theirs in zip((tube.lower, tube.upper, *others), (slow.lower, slow.upper, *slow_others), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
+    assert (record.operations, record.widths) == (slow_record.operations, slow_record.widths)
+    assert record.operations.count("identity") == 1
+    torch.testing.assert_close(record.radius, slow_record.radius, rtol=1e-6, atol=1e-9)
 
 
 def test_the_learned_robots_own_tube_does_not_enclose_the_analytical_loop(robot):
