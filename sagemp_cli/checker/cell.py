@@ -9,7 +9,7 @@ import numpy as np
 
 from sagemp_cli.checker.balls import BITS, Unproved, arb, arb_mat, ball, balls, ctx
 from sagemp_cli.checker.form import Entry, Form, Step
-from sagemp_cli.checker.functions import FUNCTIONS, leaky_relu
+from sagemp_cli.checker.functions import FUNCTIONS, clamp, leaky_relu
 from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UnsupportedOperationError
@@ -17,7 +17,8 @@ from sagemp_cli.errors import UnsupportedOperationError
 
 @dataclass(frozen=True)
 class Policy:
-    """The tracker as exact numbers: ``u = scale * MLP(error_scale * [p_{k+1} - x, ..., p_{k+N} - x]) + offset``.
+    """The tracker as exact numbers: ``u = scale * MLP(error_scale * [p_{k+1} - x, ..., p_{k+N} - x]) + offset``, the
+    network's output cut off at +-1 if it saturates.
 
     Attributes:
         weights, biases: per layer; leaky ReLU between layers.
@@ -31,6 +32,7 @@ class Policy:
     control_offset: np.ndarray
     negative_slope: float
     lookahead: int
+    saturate: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
                 step = Step(states, *w, record=_record(claim, k))
                 x = step.state()
                 u = loop.control(step, k, x)
-                _require_inside(step.bounds(u.rows()), claim.control_lower[k], claim.control_upper[k], "control")
+                asked = loop.within(step.bounds(u.rows()))
+                _require_inside(asked, claim.control_lower[k], claim.control_upper[k], "control")
                 after = _after(claim, dynamics, step, k, x, u)
                 step.finish()
                 states = states.image(after.rows())
@@ -101,7 +104,7 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
                 _require_inside(states.bounds(), claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
             if claim.heir_lower is not None and claim.heir_upper is not None:
                 _require_inside(states.bounds(), claim.heir_lower, claim.heir_upper, "state of the merged set")
-        except (Unproved, UnsupportedOperationError) as e:
+        except (Unproved, UnsupportedOperationError, ArithmeticError) as e:  # the last of a formula's own parameters
             return f"step {k}: {e}"
     return ""
 
@@ -135,15 +138,10 @@ class Loop:
         windows = [ball(reference[min(k + 1 + j // n, last), j % n]) for j in range(lookahead * n) for k in range(last)]
         shift = arb_mat(scaled) * arb_mat(lookahead * n, last, windows)
         self._biases = [[shift[h, k] + ball(policy.biases[0][h]) for h in range(hidden)] for k in range(last)]
-        scale, offset = balls(policy.control_scale), balls(policy.control_offset)
-        last_layer = [a * scale[i] for i, row in enumerate(weights[-1].tolist()) for a in row]
-        last_bias = [b * s + o for b, s, o in zip(balls(policy.biases[-1]), scale, offset, strict=True)]
-        self._layers = [
-            arb_mat(hidden, n, on_state),
-            *weights[1:-1],
-            arb_mat(len(scale), weights[-1].ncols(), last_layer),
-        ]
-        self._shifts = [*(balls(b) for b in policy.biases[1:-1]), last_bias]
+        self._layers = [arb_mat(hidden, n, on_state), *weights[1:]]
+        self._shifts = [balls(b) for b in policy.biases[1:]]
+        self._scale, self._offset = balls(policy.control_scale), balls(policy.control_offset)
+        self._limit = clamp(-1.0, 1.0) if policy.saturate else None
         self._activation = leaky_relu(policy.negative_slope)
 
     def control(self, step: Step, k: int, x: Form) -> Form:
@@ -151,7 +149,18 @@ class Loop:
         h = _shifted(self._layers[0] * x.rows(), self._biases[k])
         for weight, bias in zip(self._layers[1:], self._shifts, strict=True):
             h = _shifted(weight * step.relax("leaky_relu", self._activation, h), bias)
-        return step.split(h, (h.nrows(),))
+        if self._limit is not None:
+            h = step.relax("clamp", self._limit, h)
+        m = len(self._scale)
+        scaled = arb_mat([[s if i == j else 0 for j in range(m)] for i, s in enumerate(self._scale)]) * h
+        return step.split(_shifted(scaled, self._offset), (m,))
+
+    def within(self, controls: Sequence[tuple[arb, arb]]) -> list[tuple[arb, arb]]:
+        """Bounds of the controls, and what saturation says of them."""
+        if self._limit is None:
+            return list(controls)
+        ends = [(o - abs(s), o + abs(s)) for s, o in zip(self._scale, self._offset, strict=True)]
+        return [(low.max(a), high.min(b)) for (low, high), (a, b) in zip(controls, ends, strict=True)]
 
 
 def _shifted(rows: arb_mat, shift: Sequence[arb]) -> arb_mat:

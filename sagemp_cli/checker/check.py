@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.binding import target_class
-from sagemp_cli.checker.balls import BITS, Unproved, ball, ctx
+from sagemp_cli.binding import build, target_class
+from sagemp_cli.checker.balls import BITS, Unproved, arb, ball, ctx, number
 from sagemp_cli.checker.cell import CellClaim, Policy, prove_cell
 from sagemp_cli.checker.counterexample import applies, prove_violation
 from sagemp_cli.checker.cover import covered
 from sagemp_cli.checker.document import Document, read_document
-from sagemp_cli.checker.scene import SafeSet
+from sagemp_cli.checker.scene import SafeSet, require_known
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ArtifactError, SagempError
 from sagemp_cli.progress import Progress, Silent
@@ -98,7 +98,18 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
         safe = SafeSet.of(document.config["scene"])
         with ctx.workprec(BITS):
             problems = list(_problems(document, dynamics, safe))
-    except (LookupError, TypeError, ValueError, AttributeError, SagempError) as e:
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        RuntimeError,
+        ImportError,
+        OSError,
+        MemoryError,
+        SagempError,
+    ) as e:
         raise ArtifactError(f"{path}: /config does not describe a problem ({' '.join(str(e).split())})") from None
     except Unproved as e:
         raise ArtifactError(f"{path}: /config: {e}") from None
@@ -126,7 +137,7 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
         cells=len(tubes["cell_reference"]),
         horizon=tubes["references"].shape[1] - 1,
         seconds=time.perf_counter() - began,
-        proof_seconds=float(np.sum(tubes["seconds"])),
+        proof_seconds=sum(float(np.sum(d.tubes["seconds"])) for d in (document, document.true_model) if d is not None),
     )
 
 
@@ -154,7 +165,7 @@ def _dynamics(config: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> D
         raise ValueError(
             f"dynamics.hidden is {hidden}, but the file holds {stored} weights"
         )  # before room is made for it
-    robot = model(**{key: value for key, value in section.items() if key != "_target_"}).double().eval()
+    robot: Dynamics = build(section, "dynamics").double().eval()
     wanted = robot.state_dict()
     if weights.keys() != wanted.keys():
         odd = min(weights.keys() ^ wanted.keys())
@@ -195,8 +206,10 @@ def _problems_of_tubes(document: Document, dynamics: Dynamics, safe: SafeSet) ->
     for name in ("references", "start_lower", "start_upper", "cell_lower", "cell_upper"):
         if not np.isfinite(tubes[name]).all():
             yield f"{name} holds a number that is not finite"
+    start, w = config["start"], config["disturbance"]["radius"]
+    require_known("start", start, "center", "radius")
+    require_known("disturbance", config["disturbance"], "radius")
     try:
-        start, w = config["start"], config["disturbance"]["radius"]
         boxes = [
             ("W", tubes["disturbance_lower"], tubes["disturbance_upper"], [0.0] * n, w),
             *(("X_I", a, b, start["center"], start["radius"])
@@ -227,8 +240,14 @@ def _contains(lower: np.ndarray, upper: np.ndarray, center: Sequence[Any], radiu
     """Whether a stored box contains ``center +- radius``, exactly."""
     if not len(lower) == len(center) == len(radius):
         return False
-    sides = zip(lower, upper, center, radius, strict=True)
-    return all(ball(a) <= ball(c) - ball(r) and ball(c) + ball(r) <= ball(b) and ball(r) >= 0 for a, b, c, r in sides)
+    sides = zip(lower, upper, _sides(center, radius), radius, strict=True)
+    return all(ball(a) <= low and high <= ball(b) and ball(r) >= 0 for a, b, (low, high), r in sides)
+
+
+def _sides(center: Sequence[Any], radius: Sequence[Any]) -> list[tuple[arb, arb]]:
+    """Lower and upper end of ``center +- radius`` in each dimension."""
+    exact = [(ball(number(c)), ball(number(r))) for c, r in zip(center, radius, strict=True)]
+    return [(c - r, c + r) for c, r in exact]
 
 
 def _geometry(
@@ -264,8 +283,9 @@ def _geometry(
                 if not ball(stored) <= margin * (1 + ball(2 * _ULP)):  # stored rounded to nearest
                     raise Unproved(f"the goal margin of {name} is {float(margin):.9g}, the file says {stored:.9g}")
             reasons[r] = ""
+            named = list(zip(safe.names, map(float, distances), strict=True))
             margins[r] = (
-                {name: float(d) for name, d in zip(safe.names, distances, strict=True)},
+                {name: min(d for other, d in named if other == name) for name in safe.names},
                 {name: float(g) for name, g in zip(dynamics.state_names, goal, strict=True) if g is not None},
             )
         except Unproved as e:
@@ -353,11 +373,14 @@ def _finding(
 
 
 def _falsified(document: Document, dynamics: Dynamics, safe: SafeSet) -> bool:
-    """Whether every reference that the file calls UNSAFE has a counterexample whose violation is proved."""
+    """Whether there are references that the file calls UNSAFE, each with a counterexample whose violation is proved."""
+    start, w = document.config["start"], document.config["disturbance"]["radius"]
+    sets = _sides(start["center"], start["radius"]), _sides([0.0] * len(w), w)
     refuted = {
         int(e["reference"])
         for e in document.counterexamples
         if applies(e, document.tubes)
-        and not prove_violation(e, document.tubes, dynamics=dynamics, policy=document.policy, safe=safe)
+        and not prove_violation(e, document.tubes, *sets, dynamics=dynamics, policy=document.policy, safe=safe)
     }
-    return refuted >= {r for r, v in enumerate(document.tubes["verdict"]) if v == "UNSAFE"}
+    unsafe = {r for r, v in enumerate(document.tubes["verdict"]) if v == "UNSAFE"}
+    return bool(unsafe) and refuted >= unsafe

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,33 +17,54 @@ _BITS = 512  # a rollout has no other errors than rounding, which the loop may a
 
 
 def prove_violation(
-    example: Mapping[str, Any], tubes: Mapping[str, Any], *, dynamics: Dynamics, policy: Policy, safe: SafeSet
+    example: Mapping[str, Any],
+    tubes: Mapping[str, Any],
+    start: Sequence[tuple[arb, arb]],
+    disturbance: Sequence[tuple[arb, arb]],
+    *,
+    dynamics: Dynamics,
+    policy: Policy,
+    safe: SafeSet,
 ) -> str:
     """Prove that a rollout from X_I under disturbances in W leaves the safe set or misses the goal.
 
-    The start and the disturbances are taken from the record as exact numbers, nothing else is. The answer is empty,
-    or says in one line what could not be proved.
+    The start and the disturbances are taken from the record as exact numbers, nothing else is. The boxes stored beside
+    the tubes may be larger than X_I and W: from there everything is moved into the nearest point of those.
+
+    Args:
+        example: the record.
+        tubes: references and the stored boxes.
+        start, disturbance: X_I and W of the config, lower and upper end in each dimension.
+        dynamics, policy, safe: the loop and what it must not do.
+
+    Returns:
+        Nothing, or in one line what could not be proved.
     """
     r, step, states, disturbances = (example[key] for key in ("reference", "step", "states", "disturbances"))
     try:
         reference = tubes["references"][r]
-        start, last = states[0], len(reference) - 1
-        if not ((tubes["start_lower"][r] <= start) & (start <= tubes["start_upper"][r])).all():
+        first, last = states[0], len(reference) - 1
+        if not ((tubes["start_lower"][r] <= first) & (first <= tubes["start_upper"][r])).all():
             raise Unproved("it does not start in X_I")
         inside = (tubes["disturbance_lower"] <= disturbances) & (disturbances <= tubes["disturbance_upper"])
-        if disturbances.shape != (last, len(start)) or not inside.all() or not 0 <= step <= last:
+        if disturbances.shape != (last, len(first)) or not inside.all() or not 0 <= step <= last:
             raise Unproved("its disturbances are not in W, or its step is not one of the horizon")
         with ctx.workprec(_BITS):
-            loop, x = Loop(dynamics, policy, reference), balls(start)
+            loop, x = Loop(dynamics, policy, reference), _moved(first, start)
             for k in range(int(step)):
-                w = balls(disturbances[k])
+                w = _moved(disturbances[k], disturbance)
                 now = Step(None, w, w)
                 form = Form(now, array_of([now.constant(c) for c in x]))
                 after = dynamics.step(form, loop.control(now, k, form), now.disturbance)
                 x = [s.row[0, 0] for s in after.values]
             return "" if _violates(x, dynamics, safe, at_end=int(step) == last) else "the replay violates nothing"
-    except Unproved as e:
+    except (Unproved, ArithmeticError) as e:
         return str(e)
+
+
+def _moved(point: np.ndarray, box: Sequence[tuple[arb, arb]]) -> list[arb]:
+    """The nearest point of a box."""
+    return [x.max(low).min(high) for x, (low, high) in zip(balls(point), box, strict=True)]
 
 
 def _violates(x: list[arb], dynamics: Dynamics, safe: SafeSet, *, at_end: bool) -> bool:

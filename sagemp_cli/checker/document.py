@@ -14,10 +14,11 @@ import numpy as np
 import yaml
 
 from sagemp_cli.checker.cell import Policy
+from sagemp_cli.checker.limits import require_readable
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.storage.content import ContentError, content_hash
 
-_PLAIN_YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # plain data only, in C where it was compiled in
+_LONGEST_CONFIG = 100_000
 
 KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
 """Schemas that can be checked, with the newest version of their format that is known here."""
@@ -68,6 +69,7 @@ def read_document(path: Path) -> Document:
         raise ArtifactError(f"{path}: no such file")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
+            require_readable(file, path.stat().st_size)
             return _read(file, path)
     except ArtifactError:
         raise
@@ -102,7 +104,7 @@ def _read(file: h5py.File, path: Path) -> Document:
         raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
     if content_hash(file) != stored:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
-    config = yaml.load(file["config"].asstr()[()], Loader=_PLAIN_YAML)
+    config = _config(file["config"].asstr()[()])
     data = file["data"]
     weights = {name: _dataset(d) for name, d in data["tracker"].items()}
     examples = data.get("counterexamples", {})
@@ -110,7 +112,7 @@ def _read(file: h5py.File, path: Path) -> Document:
         kind=schema.removeprefix("sagemp/"),
         config=config,
         **_tubes(data["tubes"], path),
-        policy=_policy(weights, json.loads(data.attrs["tracker_arguments"])),
+        policy=_policy(weights, _arguments(data.attrs["tracker_arguments"])),
         robot={name: _dataset(d) for name, d in data.get("dynamics", {}).items()},
         verdict=str(data.attrs.get("verdict", "")),
         counterexamples=tuple(
@@ -125,6 +127,34 @@ def _read(file: h5py.File, path: Path) -> Document:
     if not document.robot or deviation.shape != wanted or deviation.dtype != np.float64:
         raise ArtifactError(f"{path}: /data/true_model needs a learned robot and a float64 deviation of shape {wanted}")
     return dataclasses.replace(document, true_model=dataclasses.replace(true, deviation=deviation))
+
+
+class _Plain(yaml.SafeLoader):
+    """Plain data with everything written out. Not the loader in C: deep nesting ends the process there."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """A node; an alias, by which a short text unfolds to any size, is refused."""
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("its config holds an alias")
+        return super().compose_node(parent, index)
+
+
+def _config(text: str) -> Any:
+    """What the config says, if that can be read in one way only: no key twice, no number such as ``010`` (8)."""
+    if len(text) > _LONGEST_CONFIG:
+        raise ValueError(f"its config has {len(text)} characters, more than {_LONGEST_CONFIG}")
+    config = yaml.load(text, Loader=_Plain)
+    if yaml.safe_dump(config, sort_keys=True) != text:
+        raise ValueError("its config is not written as sagemp writes it, and could be misread")
+    return config
+
+
+def _arguments(text: str) -> Any:
+    """The tracker's arguments, likewise."""
+    arguments = json.loads(text)
+    if json.dumps(arguments) != text:
+        raise ValueError("its tracker's arguments are not written as sagemp writes them, and could be misread")
+    return arguments
 
 
 def _tubes(tubes: h5py.Group, path: Path) -> dict[str, Any]:
@@ -209,11 +239,11 @@ def _require_relaxations(
 
 
 _ARGUMENTS = {"state_dim", "control_dim", "lookahead", "hidden", "negative_slope"}
-_ARGUMENTS |= {"error_scale", "control_scale", "control_offset"}
+_ARGUMENTS |= {"error_scale", "control_scale", "control_offset", "saturate"}
 
 
 def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> Policy:
-    """The tracker; ``negative_slope`` and ``lookahead`` are all that is taken from its constructor's arguments."""
+    """The tracker; of its constructor's arguments ``negative_slope``, ``lookahead`` and ``saturate`` are taken."""
     unknown = set(arguments) - _ARGUMENTS
     if unknown:
         raise ValueError(f"tracker argument '{min(unknown)}' is not understood")
@@ -223,10 +253,13 @@ def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> 
     for array in [a for pair in layers for a in pair] + scales:
         if array.dtype != np.float64 or not np.isfinite(array).all():
             raise ValueError("tracker weights must be finite float64 numbers")
+    if not isinstance(arguments.get("saturate", False), bool):
+        raise ValueError("tracker argument 'saturate' must be true or false")
     lookahead, n, m = int(arguments["lookahead"]), len(scales[0]), len(scales[1])
     widths = [lookahead * n, *(len(b) for _, b in layers)]
     fits = all(w.shape == (b, a) for (w, _), a, b in zip(layers, widths[:-1], widths[1:], strict=True))
     fits &= widths[-1] == m == len(scales[2]) and len(weights) == 2 * depth + 3
+    fits &= all(a.ndim == 1 for a in (*(b for _, b in layers), *scales))
     if depth < 2 or lookahead < 1 or not fits:
         raise ValueError("tracker weights do not fit each other")
     return Policy(
@@ -237,4 +270,5 @@ def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> 
         control_offset=scales[2],
         negative_slope=float(arguments["negative_slope"]),
         lookahead=lookahead,
+        saturate=arguments.get("saturate", False),
     )

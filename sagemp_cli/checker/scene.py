@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.checker.balls import Unproved, arb, ball
+from sagemp_cli.checker.balls import Unproved, arb, ball, number
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,24 @@ class SafeSet:
     def of(cls, scene: Mapping[str, Any]) -> SafeSet:
         """From the config's ``scene`` section."""
 
-        def known(part: Mapping[str, Any], *keys: str) -> None:
-            if not set(part) <= set(keys):
-                raise Unproved(f"the scene says '{min(set(part) - set(keys))}', which is not understood")
-
         def box(part: Mapping[str, Any], *more: str) -> tuple[list[float], list[float]]:
-            known(part, "lower", "upper", *more)
-            return [float(v) for v in part["lower"]], [float(v) for v in part["upper"]]
+            require_known("scene", part, "lower", "upper", *more)
+            lower, upper = [number(v) for v in part["lower"]], [number(v) for v in part["upper"]]
+            if not all(a <= b for a, b in zip(lower, upper, strict=True)):  # an obstacle that nothing can touch
+                raise Unproved("the scene has a box whose corners are the wrong way round")
+            return lower, upper
 
         # Landmarks and what an obstacle looks like are for planners: nothing is proved of them.
-        known(scene, "workspace", "obstacles", "goal", "name", "description", "landmarks")
+        require_known("scene", scene, "workspace", "obstacles", "goal", "name", "description", "landmarks")
         obstacles = []
         for i, item in enumerate(scene["obstacles"]):
             name = str(item.get("name", f"obstacle {i}"))
             if item["kind"] == "ball":
-                known(item, "kind", "name", "object", "center", "radius")
-                obstacles.append((name, "ball", [float(v) for v in item["center"]], float(item["radius"])))
+                require_known("scene", item, "kind", "name", "object", "center", "radius")
+                center, radius = [number(v) for v in item["center"]], number(item["radius"])
+                if not radius >= 0:
+                    raise Unproved(f"the radius of obstacle '{name}' is {radius}")
+                obstacles.append((name, "ball", center, radius))
             elif item["kind"] == "block":
                 obstacles.append((name, "block", *box(item, "kind", "name", "object")))
             else:
@@ -72,6 +74,12 @@ class SafeSet:
             sides += [] if high == np.inf else [ball(high) - ball(b)]
             margins.append(_least(sides) if sides else None)
         return margins
+
+
+def require_known(where: str, part: Mapping[str, Any], *keys: str) -> None:
+    """Refuse a section of the config that says more than is understood."""
+    if not set(part) <= set(keys):
+        raise Unproved(f"the {where} says '{min(set(part) - set(keys))}', which is not understood")
 
 
 def _least(values: list[arb]) -> arb:

@@ -188,6 +188,10 @@ class CellProver:
         began = time.perf_counter()
         with torch.no_grad(), one_thread():
             tube, u_lower, u_upper, recording = self._bound(loop, chunk.cells)
+            least, most = self.tracker.control_range()
+            more = (0, u_lower.shape[-1] - len(least))  # columns of a deviation, which may follow
+            u_lower = torch.maximum(u_lower, torch.nn.functional.pad(least, more, value=-torch.inf))
+            u_upper = torch.minimum(u_upper, torch.nn.functional.pad(most, more, value=torch.inf))
         share = (time.perf_counter() - began) / len(chunk)
         seconds = torch.full((len(chunk),), share, dtype=torch.float64)
         return CellTubes(chunk.cell_reference, chunk.cells, tube, u_lower, u_upper, seconds, recording)

@@ -15,6 +15,10 @@ class Tracker(nn.Module):
     linear layer, so it costs nothing to verify); the output is multiplied by ``control_scale`` and offset by
     ``control_offset`` (hover thrust for flying robots). With unit scales and no offset it is the paper's plain MLP.
 
+    The paper penalises control limits in training only. With ``saturate`` the network's output is cut off at +-1, so
+    that every control lies within ``control_offset +- control_scale``, whatever the error: what is proved then needs
+    no actuator that does more.
+
     Because the reference is fixed in a proof, the first layer on ``[p_{k+1} - x_k, ..., p_{k+N} - x_k]`` is one
     n-input linear layer whose bias depends on k: :meth:`folded` gives that form.
     """
@@ -30,12 +34,16 @@ class Tracker(nn.Module):
         error_scale: list[float] | None = None,
         control_scale: list[float] | None = None,
         control_offset: list[float] | None = None,
+        saturate: bool = False,
     ) -> None:
         super().__init__()
         if lookahead < 1 or not hidden or min(hidden) < 1:
             raise ConfigError(f"tracker: lookahead and hidden widths must be positive, found {lookahead} and {hidden}")
         if not 0 <= negative_slope < 1:
             raise ConfigError(f"tracker: negative_slope must lie in [0, 1), found {negative_slope}")
+        if not isinstance(saturate, bool):
+            raise ConfigError(f"tracker: saturate must be true or false, found {saturate!r}")
+        self.saturate = saturate
         self.state_dim, self.control_dim, self.lookahead = state_dim, control_dim, lookahead
         self.hidden, self.negative_slope = list(hidden), float(negative_slope)
         for key, values, size, default in (
@@ -60,7 +68,14 @@ class Tracker(nn.Module):
         """Controls ``(..., m)`` from what the first layer gives ``(..., h)``, before its activation."""
         for layer in self.layers[1:]:
             h = layer(nn.functional.leaky_relu(h, self.negative_slope))
+        if self.saturate:
+            h = h.clamp(-1.0, 1.0)
         return h * self.control_scale + self.control_offset
+
+    def control_range(self) -> tuple[Tensor, Tensor]:
+        """What no control leaves in real arithmetic, ``(m,)`` each, rounded outwards; infinite unless it saturates."""
+        reach = self.control_scale.abs() if self.saturate else torch.full_like(self.control_scale, torch.inf)
+        return tuple(_outwards(self.control_offset, side * reach) for side in (-1.0, 1.0))
 
     def folded(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """First layer on a fixed window ``(..., N, n)`` as ``weight @ x + bias``: ``(h, n)`` and ``(..., h)``.
@@ -71,3 +86,11 @@ class Tracker(nn.Module):
         blocks = first.weight.unflatten(-1, (self.lookahead, self.state_dim)) * self.error_scale
         bias = torch.einsum("hjn,...jn->...h", blocks, window) + first.bias
         return -blocks.sum(1), bias
+
+
+def _outwards(a: Tensor, b: Tensor) -> Tensor:
+    """``a + b``, rounded away from a where it is not exact (two-sum, Knuth)."""
+    total = a + b
+    part = total - a
+    exact = (part == b) & (total - part == a)
+    return torch.where(exact | torch.isinf(total), total, torch.nextafter(total, torch.inf * b.sign()))

@@ -99,9 +99,19 @@ class Case:
 
 
 def make_case(
-    robot: str = "unicycle", *, counts=(2, 1), propagator=None, hidden=(4, 4), side=0.0, disc=None, **changes
+    robot: str = "unicycle",
+    *,
+    counts=(2, 1),
+    propagator=None,
+    hidden=(4, 4),
+    side=0.0,
+    disc=None,
+    limit=None,
+    **changes,
 ) -> Case:
-    """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc."""
+    """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc;
+    ``limit`` is where the controls saturate.
+    """
     config = config_of(robot, **changes)
     if disc is not None:
         config["scene"]["obstacles"][0]["center"] = disc
@@ -110,6 +120,8 @@ def make_case(
     hover = {"planar_quadrotor": [0.5 * 9.81, 0.0], "quadrotor": [9.81, 0.0, 0.0, 0.0]}.get(robot, [0.0] * m)
     arguments = {"state_dim": n, "control_dim": m, "lookahead": 3, "hidden": list(hidden), "negative_slope": 0.1}
     arguments |= {"control_offset": hover, "control_scale": [0.5 if robot == "unicycle" else 0.05] * m}
+    if limit is not None:
+        arguments |= {"saturate": True, "control_scale": [limit] * m, "error_scale": [60.0] * n}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
         tracker = Tracker(**arguments)

@@ -1,0 +1,194 @@
+"""Files that are made to mislead, to cost more than they are, or to end the checker with anything but an answer."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from sagemp_cli.checker.check import check
+from sagemp_cli.closed_loop import ClosedLoop
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.storage import Counterexample
+
+HUGE = 10**400
+NOT_READ = "not a certificate, or a damaged one"
+
+
+def edited(edit):
+    """A change of the config, written as the stages write it."""
+
+    def change(file):
+        config = yaml.safe_load(file["config"].asstr()[()])
+        edit(config)
+        rewrite(file, yaml.safe_dump(config, sort_keys=True))
+
+    return change
+
+
+def rewrite(file, text):
+    del file["config"]
+    file.create_dataset("config", data=text, dtype=h5py.string_dtype())
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda c: c["scene"]["obstacles"][0].update(center=[0.4, 0.0], radius=-0.5), "the radius of obstacle 'disc'"),
+        (
+            lambda c: c["scene"]["obstacles"][1].update(lower=[2.0, 1.0], upper=[-1.0, -1.0]),
+            "a box whose corners are the wrong way round",
+        ),
+        (lambda c: c["scene"]["obstacles"][0].update(center="91"), "found something of type str"),
+        (lambda c: c["scene"]["obstacles"][0].update(radius=True), "found something of type bool"),
+        (lambda c: c["scene"]["obstacles"][0].update(radius=HUGE), "too large"),
+        (lambda c: c["start"].update(angle=1.0), "the start says 'angle', which is not understood"),
+        (lambda c: c["start"].update(radius=[HUGE] * 4), "too large"),
+        (lambda c: c["disturbance"].update(lower=[-1.0] * 4), "the disturbance says 'lower'"),
+        (lambda c: c["dynamics"].update(dt=HUGE), "too large"),
+        (lambda c: c["dynamics"].update(dt=True), "dynamics.dt must be float, found True"),
+        (lambda c: c["dynamics"].update(_target_="sagemp_cli.dynamics." + "a" * 300 + ".X"), "too long"),
+    ],
+)
+def test_a_config_that_could_be_misunderstood_is_refused(edit, message, certificate, mutate, tmp_path):
+    with pytest.raises(ArtifactError, match=r"/config") as error:
+        check(mutate(certificate, tmp_path / "mutant.h5", edited(edit)))
+    assert message in str(error.value)
+
+
+ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda t: "start:\n  center: [0.0, 0.0, 0.0, 1.0]\n  radius: [9.0, 9.0, 9.0, 9.0]\n" + t, "could be misread"),
+        (lambda t: t.replace("horizon: 8", "horizon: 010"), "could be misread"),
+        (lambda t: ALIASES + t.replace("name: disc", "name: *a39"), "holds an alias"),
+        (lambda t: "q: &q {dt: 0.2}\n" + t.replace("  dt: 0.1\n", "  <<: *q\n"), "holds an alias"),
+        (lambda t: t + "z: " + "[" * 1500, "recursion"),
+        (lambda t: t + "z: " + "[" * 200_000, "characters, more than"),
+    ],
+)
+def test_a_config_in_any_other_writing_is_refused(write, message, certificate, mutate, tmp_path):
+    def change(file):
+        rewrite(file, write(file["config"].asstr()[()]))
+
+    with pytest.raises(ArtifactError, match=NOT_READ) as error:
+        check(mutate(certificate, tmp_path / "mutant.h5", change))
+    assert message in str(error.value)
+
+
+def test_a_tracker_argument_that_is_there_twice_is_refused(certificate, mutate, tmp_path):
+    def change(file):
+        attributes = file["data"].attrs
+        attributes["tracker_arguments"] = '{"negative_slope": 0.9, ' + attributes["tracker_arguments"][1:]
+
+    with pytest.raises(ArtifactError, match="could be misread"):
+        check(mutate(certificate, tmp_path / "mutant.h5", change))
+
+
+def test_a_formula_that_divides_by_zero_proves_nothing(make, mutate, tmp_path):
+    source = make("quadrotor", horizon=4).write(tmp_path / "source.h5")
+    path = mutate(source, tmp_path / "mutant.h5", edited(lambda c: c["dynamics"].update(inertia=[0.0, 0.1, 0.3])))
+    assert "division by zero" in check(path).findings[0].reason
+
+
+@pytest.mark.parametrize("name", ["error_scale", "control_offset", "layers.0.bias"])
+def test_weights_with_a_dimension_more_are_refused(name, certificate, mutate, tmp_path):
+    def change(file):
+        group = file["data/tracker"]
+        values = group[name][()]
+        del group[name]
+        group[name] = values[:, None]
+
+    with pytest.raises(ArtifactError, match="tracker weights do not fit each other"):
+        check(mutate(certificate, tmp_path / "mutant.h5", change))
+
+
+def many_names(file):
+    """Fourteen groups, each with ten names in the one before: 10^13 paths."""
+    group = file.create_group("many")
+    for _ in range(13):
+        inner = group.create_group("0")
+        for i in range(1, 10):
+            group[str(i)] = inner
+        group = inner
+
+
+def nothing_stored(file):
+    file.create_dataset("data/large", shape=(2**40,), dtype="f8", chunks=(2**20,))
+
+
+def one_text_for_all(file):
+    count = 10_000
+    texts = file.create_dataset("data/texts", shape=(count,), dtype=h5py.string_dtype(), chunks=(count,))
+    texts[0] = "x" * 60_000
+    file.flush()
+    first = texts.id.read_direct_chunk((0,))[1][:16]
+    texts.id.write_direct_chunk((0,), first * count)
+    for i in range(2):
+        copy = file.create_dataset(f"data/same{i}", shape=(count,), dtype=h5py.string_dtype(), chunks=(count,))
+        copy.id.write_direct_chunk((0,), first * count)
+
+
+def lists_of_any_length(file):
+    file.create_dataset("data/lists", shape=(2,), dtype=h5py.vlen_dtype("f8"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (many_names, "an object in it has several names"),
+        (nothing_stored, "it unpacks into far more than a certificate of its size holds"),
+        (one_text_for_all, "it unpacks into far more|too many texts"),
+        (lists_of_any_length, "it holds lists of any length"),
+    ],
+)
+def test_a_file_that_unpacks_into_more_than_it_can_hold_is_refused_at_once(
+    change, message, certificate, mutate, tmp_path
+):
+    with pytest.raises(ArtifactError, match=message):
+        check(mutate(certificate, tmp_path / "mutant.h5", change, rehash=False))
+
+
+def test_of_constraints_with_one_name_the_nearest_is_reported(certificate, mutate, tmp_path):
+    def change(file):
+        edited(lambda c: [o.update(name="tree") for o in c["scene"]["obstacles"]])(file)
+        file["data/tubes/constraint_names"][...] = ["workspace", "tree", "tree"]
+
+    nearest = check(certificate).findings[0].clearance
+    assert nearest["disc"] < nearest["wall"]
+    found = check(mutate(certificate, tmp_path / "mutant.h5", change)).findings[0].clearance
+    assert found == {"workspace": nearest["workspace"], "tree": nearest["disc"]}
+
+
+def test_a_library_is_not_falsified_by_saying_so(make, mutate, tmp_path):
+    def change(file):
+        file.attrs["schema"] = "sagemp/library"
+        file["data"].attrs["verdict"] = "FALSIFIED"
+
+    path = make(disc=[0.4, 0.3]).write(tmp_path / "unknown.h5")
+    assert check(mutate(path, tmp_path / "mutant.h5", change)).answer == "UNKNOWN"
+
+
+def test_what_begins_outside_the_configs_sets_refutes_nothing(case, mutate, tmp_path):
+    loop = ClosedLoop(case.problem.dynamics, case.tracker, torch.from_numpy(case.tubes.references[0]))
+    start = torch.tensor([0.4, 0.9, 0.0, 1.0], dtype=torch.float64)  # in the disc
+    w = torch.zeros(8, 4, dtype=torch.float64)
+    tubes = dataclasses.replace(
+        case.tubes,
+        verdict=("UNSAFE",),
+        step=np.array([0]),
+        constraint=("disc",),
+        start_lower=np.full((1, 4), -5.0),
+        start_upper=np.full((1, 4), 5.0),
+    )
+    example = Counterexample(
+        reference=0, kind="collision", step=0, constraint="disc", depth=0.4,
+        states=loop.rollout(start, w)[0].detach().numpy(), disturbances=w.numpy(),
+    )  # fmt: skip
+    path = case.write(tmp_path / "certificate.h5", tubes=tubes, verdict="FALSIFIED", counterexamples=(example,))
+    assert check(path).answer == "UNKNOWN"
