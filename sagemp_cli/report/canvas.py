@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import withStroke
 
 from sagemp_cli.binding import build
 from sagemp_cli.dynamics.base import Dynamics
@@ -34,6 +35,8 @@ MODES = ("#2a6fbb", "#d9730d", "#7b4fb5", "#00838f", "#a8415b", "#5d7c15")
 """Colours of distinct things without order: sides, references, library entries."""
 TIME = LinearSegmentedColormap.from_list("time", ["#8fd3e8", "#3f8fc6", "#3a55a4", "#5a2a82", "#2d0f4f"])
 """Light to dark with time."""
+_PLATE = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
+"""What keeps a name readable on top of tubes and paths."""
 VERDICT_COLOURS = {
     "SAFE": SAFE,
     "VERIFIED": SAFE,
@@ -69,7 +72,14 @@ class Setting:
 
     def label(self, state: int) -> str:
         """Axis label of a state, with its unit."""
-        return f"{self.dynamics.state_names[state]} ({self.dynamics.state_units[state]})"
+        return f"{self.dynamics.state_names[state]} ({unit_text(self.dynamics.state_units[state])})"
+
+
+def unit_text(unit: str, *, per_second: bool = False) -> str:
+    """A unit as it is set in a figure, ``m/s^2`` as m/s²; ``per_second`` that of the derivative."""
+    if per_second:
+        unit = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+    return unit.replace("^2", "²")
 
 
 def blank_figure(width: float, height: float) -> Figure:
@@ -111,6 +121,8 @@ def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "
 
 def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
     """Workspace, obstacles, landmarks (dashed) and goal to scale; a three-dimensional scene is seen from above."""
+    if len(setting.dynamics.position) == 3:
+        axes.annotate("seen from above", (0, 1), (2, 4), "axes fraction", "offset points", fontsize=8.5, color=MUTED)
     scene, (i, j) = setting.scene, setting.plane
     low, high = scene.workspace.lower.tolist(), scene.workspace.upper.tolist()
     style_axes(axes, xlabel=setting.label(i), ylabel=setting.label(j))
@@ -133,24 +145,23 @@ def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
         outline = {"fill": False, "edgecolor": MUTED, "linewidth": 1.1, "linestyle": (0, (2, 2))}
         axes.add_patch(Circle(center, landmark.radius, zorder=2, **outline))
         if names:
-            axes.annotate(landmark.name, center, ha="center", va="center", fontsize=7.5, color=MUTED, zorder=2.5)
+            at = (center[0], center[1] - landmark.radius)
+            _name(axes, landmark.name, at, (0, -3), ha="center", va="top", fontsize=7.5, color=MUTED)
     goal_low = np.maximum([scene.goal.lower[i], scene.goal.lower[j]], low[:2])
     goal_high = np.minimum([scene.goal.upper[i], scene.goal.upper[j]], high[:2])
     axes.add_patch(_box(goal_low, goal_high, facecolor=GOAL, alpha=0.16, edgecolor="none", zorder=1.5))
-    axes.add_patch(_box(goal_low, goal_high, fill=False, edgecolor=GOAL, linewidth=1.6, zorder=6))
+    halo = [withStroke(linewidth=3.2, foreground="white")]
+    axes.add_patch(_box(goal_low, goal_high, fill=False, edgecolor=GOAL, linewidth=1.6, zorder=7.5, path_effects=halo))
     if names:
         at = (0.5 * (goal_low[0] + goal_high[0]), goal_high[1])
-        axes.annotate(
-            "goal", at, (0, 4), textcoords="offset points", ha="center", fontsize=8.5, color=GOAL, fontweight="bold"
-        )
+        _name(axes, "goal", at, (0, 4), ha="center", fontsize=8.5, color=GOAL, fontweight="bold")
 
 
 def draw_start(axes: Axes, setting: Setting) -> None:
     """The outline of X_I."""
     low, high = setting.start.lower[setting.plane].tolist(), setting.start.upper[setting.plane].tolist()
-    axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)), zorder=5))
-    at = (low[0], high[1])
-    axes.annotate("X$_I$", at, (2, 3), textcoords="offset points", fontsize=9, color=INK)
+    axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)), zorder=7.5))
+    _name(axes, "X$_I$", (low[0], high[1]), (2, 5), fontsize=9, color=INK)
 
 
 def draw_paths(axes: Axes, paths: np.ndarray, **options: Any) -> None:
@@ -161,9 +172,10 @@ def draw_paths(axes: Axes, paths: np.ndarray, **options: Any) -> None:
 def draw_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, **options: Any) -> None:
     """Boxes ``(count, 2)`` as one collection; infinite ones are left out."""
     finite = np.isfinite(lower).all(-1) & np.isfinite(upper).all(-1)
-    patches = [_box(a, b) for a, b in zip(lower[finite], upper[finite], strict=True)]
+    (left, bottom), (right, top) = np.asarray(lower)[finite].T, np.asarray(upper)[finite].T
+    corners = np.stack([left, bottom, right, bottom, right, top, left, top], axis=-1).reshape(-1, 4, 2)
     options = {k: v[finite] if isinstance(v, np.ndarray) and len(v) == len(finite) else v for k, v in options.items()}
-    axes.add_collection(PatchCollection(patches, **options))
+    axes.add_collection(PolyCollection(corners, **options), autolim=False)
 
 
 def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
@@ -176,10 +188,12 @@ def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
 
 
 def tube_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, *, alpha: float = 0.3, of: int | None = None) -> None:
-    """A tube's cross-sections ``(steps, 2)`` over the plane, coloured by time, the latest in front; ``of`` K + 1."""
-    shade = TIME(np.arange(len(lower)) / max(1, (of or len(lower)) - 1))
-    draw_boxes(axes, lower, upper, facecolors=shade, edgecolors="none", alpha=alpha, zorder=3)
-    draw_boxes(axes, lower, upper, facecolors="none", edgecolors=shade, linewidths=0.35, alpha=0.75, zorder=3.1)
+    """Cross-sections ``(cells, steps, 2)`` over the plane, coloured by time, cell after cell; ``of`` K + 1."""
+    cells, steps = lower.shape[:2]
+    shade = np.tile(TIME(np.arange(steps) / max(1, (of or steps) - 1)), (cells, 1))
+    low, high = lower.reshape(-1, 2), upper.reshape(-1, 2)
+    draw_boxes(axes, low, high, facecolors=shade, edgecolors="none", alpha=alpha, zorder=3)
+    draw_boxes(axes, low, high, facecolors="none", edgecolors=shade, linewidths=0.35, alpha=0.75, zorder=3.1)
 
 
 def time_bar(figure: Figure, axes: Axes | Sequence[Axes], seconds: float) -> None:
@@ -193,11 +207,12 @@ def time_bar(figure: Figure, axes: Axes | Sequence[Axes], seconds: float) -> Non
         orientation="horizontal",
         fraction=0.035,
         pad=0.02,
+        shrink=0.7,
         aspect=45,
     )
     bar.outline.set_visible(False)
     bar.ax.tick_params(colors=MUTED, labelsize=8.5, length=3)
-    bar.set_label("time (s)", fontsize=9.5, color=INK)
+    bar.set_label("tube: where the robot can be at time (s)", fontsize=9.5, color=INK)
 
 
 def goal_at_end(axes: Axes, setting: Setting, state: int, end: float) -> None:
@@ -225,6 +240,11 @@ def legend_above(axes: Axes, handles: Sequence[Any]) -> None:
         borderaxespad=0.1,
         columnspacing=1.4,
     )
+
+
+def _name(axes: Axes, text: str, at: Sequence[float], offset: Sequence[float], **options: Any) -> None:
+    """The name of a thing, on top of everything; ``offset`` in points."""
+    axes.annotate(text, at, offset, textcoords="offset points", zorder=9, bbox=_PLATE, **options)
 
 
 def _box(lower: Sequence[float], upper: Sequence[float], **options: Any) -> Rectangle:

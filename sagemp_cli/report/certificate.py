@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.report.canvas import (
     DANGER,
+    GOAL,
     INK,
     MODES,
     MUTED,
@@ -23,7 +26,6 @@ from sagemp_cli.report.canvas import (
     draw_scene,
     goal_at_end,
     headline,
-    legend,
     legend_above,
     shown_steps,
     style_axes,
@@ -50,7 +52,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     shown, flat = list(range(dynamics.state_dim)), len(dynamics.position) == 2
     columns = 1 if dynamics.state_dim <= 8 else 2
     rows = -(-(len(shown) + 1) // columns)
-    figure = blank_figure(12 + 2.2 * columns, max(7.2, 1.28 * rows))
+    figure = blank_figure(12 + 2.2 * columns, max(7.2, 1.4 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
 
     scene = figure.add_subplot(grid[:, 0]) if flat else space_axes(figure, grid[:, 0], setting)
@@ -74,20 +76,27 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     legend_above(scene, handles)
     time_bar(figure, scene, horizon * dynamics.dt)
 
-    times, first = dynamics.dt * np.arange(horizon + 1), None
+    times, panels = dynamics.dt * np.arange(horizon + 1), []
     for place, state in enumerate(shown):
-        axes = figure.add_subplot(grid[place % rows, 1 + place // rows], sharex=first)
-        first = first or axes
-        style_axes(axes, ylabel=setting.label(state))
-        axes.tick_params(labelbottom=False)
+        axes = figure.add_subplot(grid[place % rows, 1 + place // rows], sharex=panels[0] if panels else None)
+        panels.append(axes)
+        last = place % rows == rows - 1
+        style_axes(axes, ylabel=setting.label(state), xlabel="time (s)" if last else "")
+        axes.tick_params(labelbottom=last)
         for r in range(count):
             _band(axes, times, setting, tubes, r, state)
         for example in record.counterexamples:
             axes.plot(times, example.states[:, state], color=DANGER, linewidth=1.2, zorder=8)
         goal_at_end(axes, setting, state, times[-1])
-    axes = figure.add_subplot(grid[-1, -1], sharex=first)
+    handles = [
+        Patch(facecolor=MODES[0], alpha=0.35, label="tube of each cell"),
+        Line2D([], [], color=GOAL, lw=4, label="goal at the end"),
+    ]
+    legend_above(panels[0], handles)
+    axes = figure.add_subplot(grid[-1, -1], sharex=panels[0])
     _clearances(axes, times, setting, tubes)
     axes.set_xlim(0, times[-1])
+    figure.align_ylabels([*panels, axes])
 
     cells = len(tubes.cell_reference)
     proof = "rounding included" if tubes.rigorous else "sound in exact arithmetic"
@@ -108,16 +117,14 @@ def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alp
     mine, plane = tubes.cell_reference == reference, setting.plane
     steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, plane], tubes.tube_upper[mine][:, :steps, plane]
-    alpha = alpha / np.sqrt(max(1, len(lower) / 4))
-    for low, high in zip(lower, upper, strict=True):
-        tube_boxes(axes, low, high, alpha=alpha, of=tubes.tube_lower.shape[1])
+    tube_boxes(axes, lower, upper, alpha=alpha / np.sqrt(max(1, len(lower) / 4)), of=tubes.tube_lower.shape[1])
     draw_boxes(
         axes,
         tubes.cell_lower[mine][:, plane],
         tubes.cell_upper[mine][:, plane],
         facecolors="none",
         edgecolors=INK,
-        linewidths=0.9,
+        linewidths=float(np.clip(6 / np.sqrt(len(lower)), 0.3, 0.9)),
         zorder=5,
     )
     path = tubes.references[reference][:, plane]
@@ -129,9 +136,12 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
     mine, colour = tubes.cell_reference == reference, MODES[reference % len(MODES)]
     steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, state], tubes.tube_upper[mine][:, :steps, state]
-    for low, high in zip(lower, upper, strict=True):
-        axes.fill_between(times[:steps], low, high, color=colour, alpha=0.15, linewidth=0)
     if steps:
+        across = np.concatenate([times[:steps], times[:steps][::-1]])
+        around = np.concatenate([lower, upper[:, ::-1]], axis=1)
+        outlines = np.stack([np.broadcast_to(across, around.shape), around], axis=-1)
+        alpha = 0.15 / np.sqrt(max(1, len(lower) / 9))
+        axes.add_collection(PolyCollection(outlines, color=colour, alpha=alpha, linewidth=0), autolim=False)
         axes.plot(times[:steps], lower.min(0), color=colour, linewidth=0.9)
         axes.plot(times[:steps], upper.max(0), color=colour, linewidth=0.9)
     if steps < len(times):
@@ -140,7 +150,7 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
 
 
 def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -> None:
-    """Certified distance of the tubes to every constraint; below the red line nothing is proved."""
+    """Certified distance of the tubes to every constraint; where one is not above the red line nothing is proved."""
     index = list(setting.dynamics.position)
     lower, upper = tubes.tube_lower[..., index], tubes.tube_upper[..., index]
     lower = np.nan_to_num(lower, nan=-np.inf, posinf=-np.inf)
@@ -150,14 +160,17 @@ def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -
     names = list(tubes.constraint_names)
     if len(names) > 4:  # too many lines to tell apart
         found, names = np.stack([found[:, 0], found[:, 1:].min(1)], axis=1), [names[0], "nearest obstacle"]
+    steps = shown_steps(setting, tubes.tube_lower, tubes.tube_upper)
+    lines = [axes.axhline(0, color=DANGER, linewidth=1.1, label="contact")]
     for i, name in enumerate(names):
         colour = MUTED if i == 0 else MODES[(i - 1) % len(MODES)]
-        axes.plot(times, found[:, i], color=colour, linewidth=1.3, label=name)
-    finite = found[np.isfinite(found)]
-    bottom = min(0.0, float(finite.min())) if len(finite) else 0.0
-    axes.axhline(0, color=DANGER, linewidth=1.1)
-    axes.set_ylim(max(-1.0, bottom) - 0.1, 3.0)
-    legend(axes, loc="upper right", ncols=len(names), fontsize=7.5)
+        lines += axes.plot(times[:steps], found[:steps, i], color=colour, linewidth=1.3, label=name)
+    if steps < len(times):
+        axes.axvline(times[steps], color=UNKNOWN, linewidth=1.1, linestyle=(0, (2, 2)))
+    finite = found[:steps][np.isfinite(found[:steps])]
+    least, most = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    axes.set_ylim(max(-1.0, min(0.0, least)) - 0.1, min(3.0, 1.1 * max(most, 0.1)))
+    legend_above(axes, lines)
 
 
 def _about_model(record: Certificate, dynamics: Dynamics) -> str:

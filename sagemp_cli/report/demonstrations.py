@@ -18,6 +18,7 @@ from sagemp_cli.report.canvas import (
     headline,
     legend_above,
     style_axes,
+    unit_text,
 )
 from sagemp_cli.storage import Artifact, Demonstrations
 
@@ -32,7 +33,7 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
     sides = np.array(record.side)
     alpha = float(np.clip(12 / np.sqrt(count) / 4, 0.12, 0.8))
 
-    figure = blank_figure(13, 5.2)
+    figure = blank_figure(13, max(5.2, 1.75 * dynamics.control_dim))
     grid = figure.add_gridspec(dynamics.control_dim, 2, width_ratios=(2.3, 1))
     scene = figure.add_subplot(grid[:, 0])
     draw_scene(scene, setting)
@@ -48,7 +49,7 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
     times = dynamics.dt * np.arange(horizon)
     for i, name in enumerate(dynamics.control_names):
         axes = figure.add_subplot(grid[i, 1])
-        style_axes(axes, ylabel=f"{name} ({dynamics.control_units[i]})")
+        style_axes(axes, ylabel=f"{name} ({unit_text(dynamics.control_units[i])})")
         for side in groups:
             curves = record.controls[sides == side][..., i]
             lines = np.stack([np.broadcast_to(times, curves.shape), curves], axis=-1)
@@ -57,7 +58,7 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
             if np.isfinite(limit):
                 axes.axhline(limit, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
         axes.autoscale_view()
-        axes.set_xlim(0, times[-1])
+        axes.set_xlim(0, dynamics.dt * horizon)
     axes.set_xlabel("time (s)", fontsize=9.5)
     headline(
         figure,

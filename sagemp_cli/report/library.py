@@ -57,9 +57,10 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
     legend_above(scene, handles)
 
     axes = figure.add_subplot(grid[1])
-    names = ["certified", *record.reason_names]
+    names = ["certified", *record.reason_names, "certified, not needed"]
     values = [count, *record.reason_counts.tolist()]
-    colours = [SAFE, *(DANGER if name.startswith("reference") else UNKNOWN for name in record.reason_names)]
+    values.append(record.sampled - sum(values))  # references are drawn in batches, the last of which may bring too many
+    colours = [SAFE, *(DANGER if name.startswith("reference") else UNKNOWN for name in record.reason_names), MUTED]
     style_axes(axes, xlabel="references sampled")
     axes.barh(range(len(names)), values, color=colours, height=0.62)
     axes.set_yticks(range(len(names)), names, fontsize=9, color=INK)

@@ -79,6 +79,7 @@ def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
         figure,
         f"{label}: {100 * clear.mean():.0f} % of its plans are collision-free",
         f"{artifact.header.experiment}, {count} samples from starts drawn in X$_I$, K = {references.shape[1] - 1}; "
-        f"{100 * reaches.mean():.0f} % end in the goal box; open loop, nothing tracks them",
+        f"{100 * reaches.mean():.0f} % end in the goal box; open loop, nothing tracks them; "
+        "L, R: sides of the obstacles",
     )
     return figure

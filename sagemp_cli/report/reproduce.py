@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from sagemp_cli.errors import ArtifactError, SagempError
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.demonstrations import draw_demonstrations
+from sagemp_cli.report.dynamics import draw_dynamics
 from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.library import draw_library
 from sagemp_cli.report.planner import draw_planner
@@ -25,6 +26,7 @@ from sagemp_cli.report.training import draw_training
 from sagemp_cli.storage import (
     Certificate,
     Demonstrations,
+    DynamicsModel,
     Library,
     PlannerModel,
     Rollouts,
@@ -35,6 +37,7 @@ from sagemp_cli.storage import (
 
 FIGURES: tuple[tuple[Callable[..., Figure], tuple[tuple[str, type], ...]], ...] = (
     (draw_demonstrations, (("demonstrations", Demonstrations),)),
+    (draw_dynamics, (("dynamics", DynamicsModel),)),
     (draw_planner, (("planner", PlannerModel),)),
     (draw_training, (("tracker", TrackerModel),)),
     (draw_certificate, (("certificate", Certificate),)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from sagemp_cli.report.canvas import (
     DANGER,
@@ -28,6 +29,9 @@ from sagemp_cli.storage import Artifact, Library, Rollouts
 DRAWN = 600
 """Rollouts drawn at most, evenly spaced; those that left their tube are always drawn."""
 
+NAMED = 3
+"""References that the legend names one by one; more are told apart by colour only."""
+
 
 def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> Figure:
     """Rollouts to scale over the tubes of the references that were tracked; every state over time beside them."""
@@ -38,16 +42,19 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
     some = np.unique(np.linspace(0, total - 1, min(DRAWN, total)).astype(int))
     alpha = float(np.clip(6 / np.sqrt(len(some)) / 3, 0.08, 0.6))
 
-    figure = blank_figure(14, max(5.4, 1.35 * dynamics.state_dim))
-    grid = figure.add_gridspec(dynamics.state_dim, 2, width_ratios=(2.05, 1))
+    columns = 1 if dynamics.state_dim <= 8 else 2
+    rows = -(-dynamics.state_dim // columns)
+    figure = blank_figure(12 + 2 * columns, max(5.4, 1.35 * rows))
+    grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
     scene = figure.add_subplot(grid[:, 0])
     draw_scene(scene, setting)
     draw_start(scene, setting)
     panels, times = [], dynamics.dt * np.arange(horizon + 1)
     for i in range(dynamics.state_dim):
-        axes = figure.add_subplot(grid[i, 1], sharex=panels[0] if panels else None)
-        style_axes(axes, ylabel=setting.label(i))
-        axes.tick_params(labelbottom=i == dynamics.state_dim - 1)
+        axes = figure.add_subplot(grid[i % rows, 1 + i // rows], sharex=panels[0] if panels else None)
+        last = i % rows == rows - 1 or i == dynamics.state_dim - 1
+        style_axes(axes, ylabel=setting.label(i), xlabel="time (s)" if last else "")
+        axes.tick_params(labelbottom=last)
         panels.append(axes)
     for r in np.unique(chosen):
         mine, colour = tubes.cell_reference == r, MODES[r % len(MODES)]
@@ -69,8 +76,13 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
         axes.autoscale_view()
         axes.set_xlim(0, times[-1])
         goal_at_end(axes, setting, i, times[-1])
-    panels[-1].set_xlabel("time (s)", fontsize=9.5)
-    handles = [Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks {i}") for i in np.unique(chosen)]
+    figure.align_ylabels(panels)
+    tracked = np.unique(chosen)
+    if len(tracked) <= NAMED:
+        handles = [Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks {i}") for i in tracked]
+    else:
+        handles = [Line2D([], [], color=MODES[0], lw=2, label="rollout, coloured by reference")]
+    handles.append(Patch(facecolor=MUTED, alpha=0.25, label="tube"))
     handles.append(Line2D([], [], color=MUTED, lw=1, ls=(0, (4, 3)), label="planner's proposal"))
     legend_above(scene, handles)
 

@@ -33,7 +33,7 @@ class SafetyRow:
         reaching: references of which all rollouts were safe and reached the goal; certified ones are proved to.
         rollouts_safe: share of the rollouts that were safe, by kind of disturbance; in the row of the certified ones,
             of their closed-loop rollouts, which must be all of them; None if there are none.
-        paper: safe share in the paper, None where it has none.
+        paper: safe share in the paper, None where it has none, and for the toy problems, which are not the paper's.
         paper_sampled: references there.
     """
 
@@ -52,7 +52,8 @@ def safety_rows(artifact: Artifact[SafetyRates]) -> tuple[SafetyRow, SafetyRow, 
     """The three rows of an experiment."""
     record = artifact.record
     proved = certified(record)
-    sampled, published = PAPER.get(artifact.header.experiment, (None, {}))
+    ours_alone = artifact.header.config.get("effort", {}).get("name") == "toy"  # its scene is another one
+    sampled, published = (None, {}) if ours_alone else PAPER.get(artifact.header.experiment, (None, {}))
 
     def row(way: str, trials: Trials, those: np.ndarray, good: np.ndarray, reaching: np.ndarray) -> SafetyRow:
         clear = trials.clearance[those] > 0

@@ -25,7 +25,7 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
     axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
     low, high = setting.scene.workspace.lower.numpy(), setting.scene.workspace.upper.numpy()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.1)
+    axes.set_box_aspect(high - low, zoom=1.03)
     axes.view_init(elev=24, azim=-62)
     labels = [setting.label(i) for i in setting.dynamics.position]
     for axis, label in zip((axes.xaxis, axes.yaxis, axes.zaxis), labels, strict=True):

@@ -60,7 +60,7 @@ def draw_validation(
 ) -> None:
     """The validation's figures whose names begin with one of ``only``, shares and distances alike, on one axis."""
     curve = artifact.record.curve
-    style_axes(axes, xlabel="update", ylabel="validation")
+    style_axes(axes, xlabel="update", ylabel="share, or error in m")
     found = [
         name for name in curve.names if name.startswith(_VALIDATION) and name.removeprefix(_VALIDATION).startswith(only)
     ]
@@ -68,10 +68,12 @@ def draw_validation(
         column = curve.values[:, curve.names.index(name)]
         measured = np.isfinite(column)
         style = {"color": colour, "linewidth": 1.4, "marker": "o", "markersize": 3}
-        axes.plot(curve.step[measured], column[measured], label=name.removeprefix(_VALIDATION), **style)
+        label = name.removeprefix(_VALIDATION)
+        axes.plot(curve.step[measured], column[measured], label=label, **style)
     axes.set_ylim(0, 1.05)
     if found:
-        legend(axes, loc="best", ncols=2, fontsize=7.5)
+        columns = 3 if max(map(len, found)) <= 30 else 1  # what stands in is named, and takes a line of its own
+        legend(axes, loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=columns, borderaxespad=0.1, fontsize=7.5)
 
 
 def _positive(column: np.ndarray) -> bool:

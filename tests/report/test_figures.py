@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from sagemp_cli.errors import ResourceError
-from sagemp_cli.report.canvas import Setting, blank_figure, shown_steps
+from sagemp_cli.report.canvas import Setting, blank_figure, shown_steps, unit_text
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import save_figure
-from sagemp_cli.report.reproduce import draw_experiment, main
-from sagemp_cli.storage import Certificate, Counterexample, read_artifact
+from sagemp_cli.report.library import draw_library
+from sagemp_cli.report.reproduce import FIGURES, draw_experiment, main
+from sagemp_cli.report.rollouts import NAMED, draw_rollouts
+from sagemp_cli.storage import KINDS, Certificate, Counterexample, Library, Rollouts, read_artifact
+
+TUBE = ("tube_lower", "tube_upper")
 
 
 def texts(figure):
@@ -18,9 +22,18 @@ def texts(figure):
     return [t.get_text() for t in figure.texts]
 
 
+def labels(figure):
+    """What all legends of a figure say."""
+    return [t.get_text() for axes in figure.axes if axes.get_legend() for t in axes.get_legend().get_texts()]
+
+
 @pytest.fixture
 def certificate(toy_folder):
     return read_artifact(toy_folder / "certificate.h5", Certificate)
+
+
+def test_every_kind_of_artifact_has_a_figure():
+    assert {sources[0][1] for _, sources in FIGURES} == {kind.record for kind in KINDS}
 
 
 def test_all_figures_of_an_experiment_are_made_from_its_artifacts_alone(toy_root, toy_folder, tmp_path, capsys):
@@ -108,8 +121,55 @@ def test_a_counterexample_is_drawn(certificate, tmp_path):
     figure = draw_certificate(bad)
     save_figure(figure, tmp_path / "bad.png")
     assert texts(figure)[0].startswith("Falsified")
-    labels = [t.get_text() for axes in figure.axes if axes.get_legend() for t in axes.get_legend().get_texts()]
-    assert "counterexample" in labels
+    assert "counterexample" in labels(figure)
+
+
+def test_everything_in_the_figure_of_a_certificate_is_named(certificate):
+    named = labels(draw_certificate(certificate))
+    assert named[:4] == ["reference", "start cells", "tube of each cell", "goal at the end"]
+    assert named[4:] == ["contact", *certificate.record.tubes.constraint_names]
+
+
+def test_a_figure_has_no_more_to_draw_the_more_cells_there_are(certificate):
+    tubes = certificate.record.tubes
+    cells = {f: np.repeat(getattr(tubes, f), 100, axis=0) for f in ("cell_reference", "cell_lower", "cell_upper")}
+    many = changed(certificate, **cells, **{f: np.repeat(getattr(tubes, f), 100, axis=0) for f in TUBE})
+    parts = [len(axes.get_children()) for axes in draw_certificate(certificate).axes]
+    assert [len(axes.get_children()) for axes in draw_certificate(many).axes] == parts
+
+
+def test_the_account_of_a_library_adds_up_to_what_was_sampled(toy_folder):
+    library = read_artifact(toy_folder / "library.h5", Library)
+    record = dataclasses.replace(library.record, sampled=library.record.sampled + 3)
+    bars = draw_library(dataclasses.replace(library, record=record)).axes[1].patches
+    assert sum(bar.get_width() for bar in bars) == record.sampled
+    assert bars[-1].get_width() >= 3
+
+
+@pytest.mark.parametrize("count", [NAMED, NAMED + 1])
+def test_the_legend_of_rollouts_names_references_one_by_one_only_if_they_are_few(toy_folder, count):
+    library = read_artifact(toy_folder / "library.h5", Library)
+    rollouts = read_artifact(toy_folder / "rollouts.h5", Rollouts)
+    tubes, record = library.record.tubes, rollouts.record
+    one = tubes.cell_reference == 0
+    cells = {"cell_reference": np.repeat(np.arange(count), one.sum())}
+    cells |= {f: np.concatenate([getattr(tubes, f)[one]] * count) for f in TUBE}
+    library = dataclasses.replace(
+        library, record=dataclasses.replace(library.record, tubes=dataclasses.replace(tubes, **cells))
+    )
+    query = np.arange(len(record.query)) % count
+    record = dataclasses.replace(record, chosen=np.arange(count), query=query)
+    named = labels(draw_rollouts(dataclasses.replace(rollouts, record=record), library))
+    each = [f"tracks {i}" for i in range(count)] if count <= NAMED else ["rollout, coloured by reference"]
+    assert named == [*each, "tube", "planner's proposal"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_second", "text"),
+    [("m/s^2", False, "m/s²"), ("m", True, "m/s"), ("rad/s", True, "rad/s²"), ("N m", False, "N m")],
+)
+def test_units_are_set_as_in_print(unit, per_second, text):
+    assert unit_text(unit, per_second=per_second) == text
 
 
 def test_a_figure_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path):

@@ -27,6 +27,9 @@ def test_title_and_panels_state_the_counts_and_the_papers_where_there_are_some(a
     said = [t.get_text() for axes in figure.axes for t in axes.texts]
     assert not any("paper" in text for text in said)
     header = dataclasses.replace(artifact.header, experiment="planar_cfm")
+    toy = draw_safety(dataclasses.replace(artifact, header=header))
+    assert not any("paper" in t.get_text() for axes in toy.axes for t in axes.texts)  # its scene is not the paper's
+    header = dataclasses.replace(header, config={**header.config, "effort": {"name": "full", "suffix": ""}})
     said = [t.get_text() for axes in draw_safety(dataclasses.replace(artifact, header=header)).axes for t in axes.texts]
     for share in ("68.5", "81.5", "100"):
         assert any(f"paper: {share} % of 108" in text for text in said)
