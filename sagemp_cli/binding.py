@@ -74,19 +74,50 @@ def option_complaints(
     options = {} if options is None else options
     if not isinstance(options, Mapping):
         return [f"{where} must be a mapping, found {options!r}"]
-    parameters = inspect.signature(function).parameters
+    parameters = parameters_of(function)
     allowed = [k for k in parameters if k not in given]
     found = []
     for key, value in options.items():
         if key not in allowed:
             near = did_you_mean(str(key), allowed) or f"; known: {', '.join(allowed) or 'none'}"
             found.append(f"{where}.{key}: {function.__name__} has no such option{near}")
-        elif not _fits(value, _hint(function, parameters[key].annotation)):
-            found.append(f"{where}.{key} must be {parameters[key].annotation}, found {value!r}")
-    missing = [k for k in allowed if parameters[k].default is inspect.Parameter.empty and k not in options]
+        elif not _fits(value, _hint(*parameters[key])):
+            found.append(f"{where}.{key} must be {parameters[key][0].annotation}, found {value!r}")
+    missing = [k for k in allowed if parameters[k][0].default is inspect.Parameter.empty and k not in options]
     if missing:
         found.append(f"{where}: {function.__name__} needs {', '.join(missing)}")
     return found
+
+
+def parameters_of(function: Callable[..., Any]) -> dict[str, tuple[inspect.Parameter, Callable[..., Any]]]:
+    """The parameters of a function or of a class's constructor by name, each with the function that declares it.
+
+    A constructor that takes ``**others`` hands them to its base class, so those of the base class are parameters too.
+    """
+    if not inspect.isclass(function):
+        return {name: (p, function) for name, p in inspect.signature(function).parameters.items()}
+    found: dict[str, tuple[inspect.Parameter, Callable[..., Any]]] = {}
+    for constructor in (cls.__init__ for cls in function.__mro__[:-1] if "__init__" in vars(cls)):
+        _, *own = inspect.signature(constructor).parameters.values()
+        named = {p.name: (p, constructor) for p in own if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+        found = named | found
+        if not any(p.kind is p.VAR_KEYWORD for p in own):
+            break
+    return found
+
+
+def options_for(
+    function: Callable[..., Any], options: Any, where: str, *, given: Collection[str] = ()
+) -> dict[str, Any]:
+    """Options as keyword arguments of a function or class that takes them all: none is silently ignored.
+
+    Raises:
+        ConfigError: one line with all :func:`option_complaints`, whose arguments these are.
+    """
+    wrong = option_complaints(function, options, where, given=given)
+    if wrong:
+        raise ConfigError("; ".join(wrong))
+    return dict(options or {})
 
 
 def all_complaints(config: Mapping[str, Any]) -> list[str]:
@@ -105,12 +136,11 @@ def _only_from_data(complaint: str) -> bool:
     return bool(needs) and set(names.split(", ")) <= set(FROM_DATA)
 
 
-def _hint(function: Callable[..., Any], annotation: Any) -> Any:
-    """The type that an annotation names; Any if it is a name that exists for type checkers only."""
-    home = function.__init__ if inspect.isclass(function) else function
-    holder = SimpleNamespace(__annotations__={"it": annotation})
+def _hint(parameter: inspect.Parameter, declared: Callable[..., Any]) -> Any:
+    """The type that a parameter's annotation names; Any if it is a name that exists for type checkers only."""
+    holder = SimpleNamespace(__annotations__={"it": parameter.annotation})
     try:
-        return get_type_hints(holder, globalns=getattr(home, "__globals__", {}))["it"]
+        return get_type_hints(holder, globalns=getattr(declared, "__globals__", {}))["it"]
     except NameError:
         return Any
 
@@ -132,18 +162,6 @@ def _fits(value: Any, hint: Any) -> bool:
     return True
 
 
-def arguments_of(section: Mapping[str, Any], where: str, **extra: Any) -> dict[str, Any]:
-    """The keyword arguments of a section (plus ``extra``), checked against the constructor's signature.
-
-    Raises:
-        ConfigError: one line with all :func:`complaints`.
-    """
-    wrong = complaints(section, where, **extra)
-    if wrong:
-        raise ConfigError("; ".join(wrong))
-    return {k: v for k, v in section.items() if k != "_target_"} | extra
-
-
 def build(section: Mapping[str, Any], where: str, **extra: Any) -> Any:
     """Build the object that a config section describes.
 
@@ -152,9 +170,10 @@ def build(section: Mapping[str, Any], where: str, **extra: Any) -> Any:
         where: name of the section in messages.
         extra: further keyword arguments that come from data, not from the config.
     """
-    arguments = arguments_of(section, where, **extra)
+    cls = target_class(section, where)
+    options = options_for(cls, {k: v for k, v in section.items() if k != "_target_"}, where, given=extra)
     try:
-        return target_class(section, where)(**arguments)
+        return cls(**options, **extra)
     except (TypeError, ValueError) as e:
         first = next((line for line in str(e).splitlines() if line.strip()), type(e).__name__)
         raise ConfigError(f"{where}: {first.strip()}") from e

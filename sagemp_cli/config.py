@@ -13,23 +13,7 @@ from typing import Any
 
 import yaml
 
-from sagemp_cli.binding import ALLOWED_PACKAGES, all_complaints, arguments_of, build, complaints, target_class
 from sagemp_cli.errors import ConfigError, did_you_mean
-
-__all__ = [
-    "ALLOWED_PACKAGES",
-    "all_complaints",
-    "arguments_of",
-    "build",
-    "chosen_options",
-    "complaints",
-    "compose",
-    "groups",
-    "load_scene",
-    "options_of",
-    "resource_folder",
-    "target_class",
-]
 
 _PACKAGE = Path(__file__).resolve().parent
 

@@ -20,6 +20,8 @@ EXIT_UNKNOWN = 5
 """The proof did not succeed and no counterexample was found."""
 EXIT_FALSIFIED = 10
 """A replayed counterexample shows that the claim is false."""
+ANSWER_CODES = {"VERIFIED": EXIT_CERTIFIED, "FALSIFIED": EXIT_FALSIFIED, "UNKNOWN": EXIT_UNKNOWN}
+"""Exit codes of the answers of ``verify`` and ``check``."""
 EXIT_TIME_LIMIT = 124
 """A time limit given by the user ran out."""
 EXIT_INTERRUPTED = 130

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sagemp_cli.binding import FROM_DATA, build, target_class
+from sagemp_cli.binding import FROM_DATA, build, parameters_of, target_class
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ArtifactError
@@ -35,7 +34,7 @@ def data_arguments(section: Mapping[str, Any], where: str, dynamics: Dynamics, h
         "horizon": horizon,
         "dt": dynamics.dt,
     }
-    wanted = inspect.signature(target_class(section, where)).parameters
+    wanted = parameters_of(target_class(section, where))
     return {key: known[key] for key in FROM_DATA if key in wanted}
 
 

@@ -37,6 +37,9 @@ Everything random (batches, noise) is drawn from ``generator``, whose state is p
 draws from torch's global generator cannot be resumed exactly.
 """
 
+GIVEN_TO_TRAINING = ("generator", "checkpoint", "identity", "progress")
+"""Arguments of :func:`fit` and of all that ends in it which a stage gives, and no config."""
+
 Validation = Callable[[nn.Module], Mapping[str, float]]
 """``validate(module)``: figures of the module in evaluation mode, without gradients; always the same names."""
 

@@ -19,7 +19,8 @@ torch.set_num_threads(1)
 def toy_root(tmp_path_factory) -> Path:
     """The folder that the toy experiment's artifacts were written below; treat it as read-only."""
     from sagemp_cli.config import compose
-    from sagemp_cli.stages.stage import STAGES, StageContext
+    from sagemp_cli.stages.context import StageContext
+    from sagemp_cli.stages.stage import STAGES
 
     root = tmp_path_factory.mktemp("artifacts")
     config = compose(["effort=toy", f"artifacts={root}"])

@@ -33,7 +33,7 @@ def test_a_section_becomes_the_object_that_it_describes():
         "builtins.eval",
         "subprocess.Popen",
         "sagemp_cli.storage.artifact.Header",
-        "sagemp_cli.stages.stage.StageContext",
+        "sagemp_cli.stages.context.StageContext",
         "sagemp_cli.config.Path",
         "sagemp_cli.dynamics",
         "sagemp_cli",
@@ -75,6 +75,16 @@ def test_complaints_name_unknown_missing_and_mistyped_options_all_at_once():
         "dynamics.dtt: Unicycle has no such option (did you mean 'dt'?)",
         "dynamics.disturbance must be str, found 3",
         "dynamics: Unicycle needs dt",
+    ]
+
+
+def test_options_of_the_base_class_are_options_of_a_class_that_hands_them_on():
+    section = UNICYCLE | {"_target_": "sagemp_cli.dynamics.planar_quadrotor.PlanarQuadrotor", "dt": "fast", "mas": 1.0}
+    del section["state_lower"]
+    assert complaints(section, "dynamics") == [
+        "dynamics.dt must be float, found 'fast'",
+        "dynamics.mas: PlanarQuadrotor has no such option (did you mean 'mass'?)",
+        "dynamics: PlanarQuadrotor needs state_lower",
     ]
 
 

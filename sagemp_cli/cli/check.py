@@ -10,7 +10,7 @@ import typer
 
 from sagemp_cli.cli.command import examples
 from sagemp_cli.cli.options import Json
-from sagemp_cli.errors import EXIT_CERTIFIED, EXIT_FALSIFIED, EXIT_UNKNOWN
+from sagemp_cli.errors import ANSWER_CODES
 
 if TYPE_CHECKING:
     from sagemp_cli.checker.check import Finding, Report
@@ -20,7 +20,6 @@ EXAMPLES = examples(
     "sagemp check artifacts/unicycle_node/library.h5 --processes 2",
     "sagemp check certificate.h5 --json | jq .answer",
 )
-_CODES = {"VERIFIED": EXIT_CERTIFIED, "FALSIFIED": EXIT_FALSIFIED, "UNKNOWN": EXIT_UNKNOWN}
 
 
 def check(
@@ -41,7 +40,7 @@ def check(
     torch.set_num_threads(1)
     report = prove(file, processes=processes, progress=console_progress())
     typer.echo(json.dumps(as_data(report), indent=2) if as_json else "\n".join(as_lines(report)))
-    raise typer.Exit(_CODES[report.answer])
+    raise typer.Exit(ANSWER_CODES[report.answer])
 
 
 def as_lines(report: Report) -> list[str]:
@@ -52,7 +51,7 @@ def as_lines(report: Report) -> list[str]:
         f" {report.horizon} (the file claims {report.claimed})",
         *(f"  the file: {problem}" for problem in report.problems),
     ]
-    lines += [_line(f, "reference") for f in report.findings]
+    lines += [_line(f, "reference", falsified=report.answer == "FALSIFIED") for f in report.findings]
     if report.true_model is not None:
         lines.append("  the robot is a network learned from an analytical model; of that model itself:")
         lines += [_line(f, "  reference") for f in report.true_model]
@@ -61,7 +60,9 @@ def as_lines(report: Report) -> list[str]:
     return lines
 
 
-def _line(f: Finding, what: str) -> str:
+def _line(f: Finding, what: str, *, falsified: bool = False) -> str:
+    if falsified and f.claimed == "UNSAFE":  # a file is FALSIFIED only if each of these has a proved counterexample
+        return f"  {what} {f.reference}: UNSAFE: its counterexample is proved"
     if not f.proved:
         verb = "NOT PROVED" if f.claimed == "SAFE" else f.claimed
         return f"  {what} {f.reference}: {verb}: {f.reason}"
@@ -78,7 +79,7 @@ def as_data(report: Report) -> dict[str, Any]:
         "kind": report.kind,
         "claimed": report.claimed,
         "answer": report.answer,
-        "exit_code": _CODES[report.answer],
+        "exit_code": ANSWER_CODES[report.answer],
         "horizon": report.horizon,
         "cells": report.cells,
         "problems": list(report.problems),

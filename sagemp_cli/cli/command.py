@@ -31,7 +31,8 @@ class Command(TyperCommand):
             code = e.exit_code
         except KeyboardInterrupt:
             _complain(
-                "interrupted: nothing half-written is left, finished pieces are kept; run the same command to go on"
+                "interrupted: nothing half-written is left;"
+                " run the same command again, finished pieces are not made twice"
             )
             code = EXIT_INTERRUPTED
         except BrokenPipeError:

@@ -24,7 +24,7 @@ def show(overrides: Overrides = None) -> None:
     typer.echo(yaml.safe_dump(compose(overrides or []), sort_keys=False, default_flow_style=None), nl=False)
 
 
-@app.command(cls=Command, epilog=examples("sagemp config validate", "sagemp config validate planner.hidden=64"))
+@app.command(cls=Command, epilog=examples("sagemp config validate", "sagemp config validate planner.hidden=32"))
 def validate(overrides: Overrides = None) -> None:
     """Bind every option of every group to what it configures and report all errors at once.
 

@@ -67,7 +67,8 @@ def _version(package: str) -> str | None:
 
 def _test(option: str) -> dict[str, Any]:
     """One propagator of the config: sound, unsound, or why it does not work here."""
-    from sagemp_cli.config import build, compose
+    from sagemp_cli.binding import build
+    from sagemp_cli.config import compose
     from sagemp_cli.errors import SagempError
     from sagemp_cli.reachability.selftest import sound_on_a_small_loop
 

@@ -27,7 +27,8 @@ def inspect(
 ) -> None:
     """Show what an artifact is, how and from what it was made, and what it holds.
 
-    Everything is read and checked against the declaration of its kind; parents are compared by hash.
+    Everything is read and checked against the declaration of its kind; the content and the files that it was made
+    from are compared by hash.
     """
     from sagemp_cli.storage import open_header, read_artifact
 
@@ -48,6 +49,7 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
         "kind": kind.name,
         "format": kind.version,
         "sha256": artifact.sha256,
+        "content": _content(artifact.path),
         "stage": header.stage,
         "experiment": header.experiment,
         "seed": header.seed,
@@ -63,6 +65,17 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
         "fields": list(_fields(artifact.record, "")),
         "verdicts": _verdicts(artifact.record),
     }
+
+
+def _content(path: Path) -> str:
+    """Whether the stored hash of the content is still that of the content; it finds accidents, no forgers."""
+    import h5py
+
+    from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
+
+    with h5py.File(path, "r") as file:
+        same = str(file.attrs.get(HASH_ATTRIBUTE, "")) == content_hash(file)
+    return "as it was written" if same else "CHANGED since it was written (its hash differs)"
 
 
 def _now(path: Path, sha256: str) -> str:
@@ -128,7 +141,8 @@ def _print(content: dict[str, Any]) -> None:
     if not console.is_terminal:
         console = Console(width=200)  # nobody resizes a pipe: one line per field
     facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    for key in ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256"):
+    keys = ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256")
+    for key in (*keys, "content"):
         value = content[key]
         facts.add_row(Text(key, style="bold"), Text(f"{value:.1f}" if isinstance(value, float) else str(value)))
     facts.add_row(Text("packages", style="bold"), Text(", ".join(f"{k} {v}" for k, v in content["packages"].items())))

@@ -12,7 +12,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="KEY=VALUE",
-        help="Config overrides, e.g. experiment=unicycle_node planner.hidden=64.",
+        help="Config overrides, e.g. experiment=unicycle_node planner.hidden=32.",
         show_default=False,
     ),
 ]

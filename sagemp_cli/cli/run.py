@@ -16,13 +16,14 @@ from sagemp_cli.cli.time_limit import time_limit as limited
 from sagemp_cli.errors import ArtifactError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from sagemp_cli.stages.stage import Stage, StageContext
+    from sagemp_cli.stages.context import StageContext
+    from sagemp_cli.stages.stage import Stage
 
 EXAMPLES = examples(
     "sagemp run",
     "sagemp run experiment=unicycle_node effort=demo",
     "sagemp run --until verify --partitions 4",
-    "sagemp run planner.hidden=64 --dry-run",
+    "sagemp run planner.hidden=32 --dry-run",
 )
 
 

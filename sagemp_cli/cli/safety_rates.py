@@ -12,8 +12,7 @@ import typer
 
 from sagemp_cli.cli.command import examples
 from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
-from sagemp_cli.cli.stage_command import announce, context_of, explain, refuse_existing_output, require_inputs
-from sagemp_cli.cli.time_limit import time_limit as limited
+from sagemp_cli.cli.stage_command import announce, output_of
 from sagemp_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ def safety_rates(
     finished cells.
     """
     from sagemp_cli.report.safety_table import all_safety_rows, safety_rows
-    from sagemp_cli.stages.freshness import Freshness, survey
     from sagemp_cli.storage import SafetyRates, read_artifact
 
     given = overrides_of(overrides, seed=seed, partitions=partitions)
@@ -58,24 +56,12 @@ def safety_rates(
             )
         _show(all_safety_rows(_root(given)), as_json=as_json)
         return
-    context = context_of(given, overwrite=overwrite)
-    states = survey(context, last="safety-rates")
-    state = states["safety-rates"]
-    known = state.freshness is Freshness.FRESH and not overwrite
-    if not known:
-        refuse_existing_output(state, overwrite)
-        require_inputs(context, states, "safety-rates", given)
-    if dry_run:
-        if known:
-            typer.echo(f"sagemp safety-rates would print the rates of {state.path}, which is up to date")
-        else:
-            explain(context, states, "safety-rates")
+    made = output_of("safety-rates", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit, shown="the rates")
+    if made is None:
         return
-    with limited(time_limit):
-        path = state.path if known else state.stage.run(context)
-    _show(safety_rows(read_artifact(path, SafetyRates)), as_json=as_json)
+    _show(safety_rows(read_artifact(made[0], SafetyRates)), as_json=as_json)
     if not as_json:
-        announce(path)
+        announce(made[0])
 
 
 def _root(given: Sequence[str]) -> Path:

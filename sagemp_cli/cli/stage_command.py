@@ -1,4 +1,4 @@
-"""What the six stage commands share: compose the config, check, run one stage, say what it wrote."""
+"""What the stage commands share: compose the config, check, run one stage, say what it wrote."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sagemp_cli.cli.time_limit import time_limit
 from sagemp_cli.errors import ArtifactError
 
 if TYPE_CHECKING:
+    from sagemp_cli.stages.context import StageContext
     from sagemp_cli.stages.freshness import FileState
-    from sagemp_cli.stages.stage import StageContext
 
 
 def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext:
@@ -22,8 +22,8 @@ def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext
 
     from sagemp_cli.cli.console import console_progress
     from sagemp_cli.config import compose
+    from sagemp_cli.stages.context import StageContext
     from sagemp_cli.stages.requirements import require_sound_config
-    from sagemp_cli.stages.stage import StageContext
 
     torch.set_num_threads(1)  # several processes with several threads each slow each other down many times over
     config = compose(overrides)
@@ -31,22 +31,46 @@ def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext
     return StageContext.of(config, overwrite=overwrite, progress=console_progress())
 
 
-def run_stage(name: str, overrides: list[str], *, overwrite: bool, dry_run: bool, seconds: float | None = None) -> None:
+def run_stage(name: str, overrides: list[str], *, overwrite: bool, dry_run: bool, seconds: float | None) -> None:
     """Run one stage and print the path of what it wrote."""
-    from sagemp_cli.stages.freshness import survey
+    made = output_of(name, overrides, overwrite=overwrite, dry_run=dry_run, seconds=seconds)
+    if made is not None:
+        announce(made[0])
+
+
+def output_of(
+    name: str, overrides: list[str], *, overwrite: bool, dry_run: bool, seconds: float | None, shown: str = ""
+) -> tuple[Path, bool] | None:
+    """The path of a stage's output, and whether it was there already; None if the stage is not to run.
+
+    Args:
+        name: of the stage.
+        overrides: of the config.
+        overwrite: whether an existing output may be replaced.
+        dry_run: only say what would be done.
+        seconds: time limit.
+        shown: what the command prints of an output that is up to date; without it such an output is in the way.
+    """
+    from sagemp_cli.stages.freshness import Freshness, survey
 
     context = context_of(overrides, overwrite=overwrite)
     states = survey(context, last=name)
-    refuse_existing_output(states[name], overwrite)
-    require_inputs(context, states, name, overrides)
+    state = states[name]
+    known = bool(shown) and state.freshness is Freshness.FRESH and not overwrite
+    if not known:
+        _refuse_existing(state, overwrite)
+        _require_inputs(context, states, name, overrides)
     if dry_run:
-        explain(context, states, name)
-        return
+        if known:
+            typer.echo(f"sagemp {name} would print {shown} of {state.path}, which is up to date")
+        else:
+            explain(context, states, name)
+        return None
     with time_limit(seconds):
-        announce(states[name].stage.run(context))
+        return (state.path if known else state.stage.run(context)), known
 
 
-def refuse_existing_output(state: FileState, overwrite: bool) -> None:
+def _refuse_existing(state: FileState, overwrite: bool) -> None:
     """Raise if the output is there already: nothing that exists is replaced unasked."""
     from sagemp_cli.stages.freshness import Freshness
 
@@ -60,7 +84,7 @@ def refuse_existing_output(state: FileState, overwrite: bool) -> None:
     raise ArtifactError(f"{state.path}: {what}; pass --overwrite to remake it ('sagemp run' skips what is up to date)")
 
 
-def require_inputs(context: StageContext, states: dict[str, FileState], name: str, overrides: list[str]) -> None:
+def _require_inputs(context: StageContext, states: dict[str, FileState], name: str, overrides: list[str]) -> None:
     """Raise if an input is not there, and say which command makes it."""
     from sagemp_cli.stages.freshness import Freshness
 
@@ -68,12 +92,17 @@ def require_inputs(context: StageContext, states: dict[str, FileState], name: st
     missing = [s for s in read if states[s].freshness is Freshness.MISSING]
     if missing:
         said = "".join(f" {shlex.quote(o)}" for o in overrides)
-        owner = context.owner(missing[0])
-        where = said if owner is context else f" experiment={owner.config['name']}"
         raise ArtifactError(
-            f"{states[missing[0]].path}: missing; make it with 'sagemp {missing[0]}{where}'"
+            f"{states[missing[0]].path}: missing; {maker(context, missing[0], overrides)}"
             f" (or 'sagemp run{said}', which makes everything that is missing)"
         )
+
+
+def maker(context: StageContext, name: str, overrides: list[str]) -> str:
+    """The command that makes a stage's file, as it is typed: with this call's overrides, or in its own experiment."""
+    owner = context.owner(name)
+    said = overrides if owner is context else [f"experiment={owner.config['name']}"]
+    return f"make it with 'sagemp {name}{''.join(f' {shlex.quote(o)}' for o in said)}'"
 
 
 def explain(context: StageContext, states: dict[str, FileState], name: str) -> None:
@@ -82,7 +111,7 @@ def explain(context: StageContext, states: dict[str, FileState], name: str) -> N
     typer.echo(f"sagemp {name} would")
     for source in state.stage.inputs_in(context.config):
         typer.echo(f"  read     {states[source].path} ({states[source].freshness})")
-    typer.echo(f"  {'replace' if state.path.exists() else 'write'}    {state.path}")
+    typer.echo(f"  {'replace' if state.path.exists() else 'write':<7}  {state.path}")
 
 
 def announce(path: Path) -> None:

@@ -8,12 +8,12 @@ import typer
 
 from sagemp_cli.cli.command import examples
 from sagemp_cli.cli.options import Json, Overrides, Partitions, Seed, overrides_of
-from sagemp_cli.cli.stage_command import context_of
+from sagemp_cli.cli.stage_command import context_of, maker
 
 EXAMPLES = examples(
     "sagemp status",
     "sagemp status experiment=unicycle_node effort=demo",
-    "sagemp status --json | jq '.files\\[].state'",
+    "sagemp status --json | jq '.files[].state'",
 )
 _STYLES = {"fresh": "green", "stale": "yellow", "missing": "dim", "damaged": "red"}
 
@@ -25,10 +25,15 @@ def status(
 
     A file is stale if a config key that it depends on, or one of its inputs, has changed since it was made.
     """
-    from sagemp_cli.stages.freshness import survey
+    from sagemp_cli.stages.freshness import Freshness, survey
 
-    context = context_of(overrides_of(overrides, seed=seed, partitions=partitions))
+    given = overrides_of(overrides, seed=seed, partitions=partitions)
+    context = context_of(given)
     states = survey(context)
+    why = {
+        name: maker(context, name, given) if state.freshness is Freshness.MISSING else state.why
+        for name, state in states.items()
+    }
     if as_json:
         files = [
             {
@@ -36,7 +41,7 @@ def status(
                 "file": str(state.path),
                 "inputs": list(state.stage.inputs_in(context.config)),
                 "state": str(state.freshness),
-                "why": state.why,
+                "why": why[name],
                 "created_utc": state.header.created_utc if state.header else None,
                 "seconds": state.header.seconds if state.header else None,
                 "sha256": state.sha256 or None,
@@ -65,7 +70,7 @@ def status(
             ", ".join(states[i].stage.role for i in state.stage.inputs_in(context.config) if i in states) or "-",
             state.path.name,
             Text(str(state.freshness), style=_STYLES[state.freshness]),
-            Text(state.why or made),
+            Text(why[name] or made),
         )
     console.print(f"{context.config['name']} in {context.folder}", markup=False, highlight=False)
     console.print(table)

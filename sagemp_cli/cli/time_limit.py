@@ -38,8 +38,8 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         if not ran_out:
             raise
         raise TimeLimitError(
-            f"--time-limit {seconds:g} ran out: nothing half-written is left, finished pieces are kept;"
-            " run the same command to go on"
+            f"--time-limit {seconds:g} ran out: nothing half-written is left;"
+            " run the same command again, finished pieces are not made twice"
         ) from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)

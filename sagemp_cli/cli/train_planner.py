@@ -8,7 +8,7 @@ from sagemp_cli.cli.stage_command import run_stage
 
 EXAMPLES = examples(
     "sagemp train-planner",
-    "sagemp train-planner planner.hidden=64 --overwrite",
+    "sagemp train-planner planner.hidden=32 --overwrite",
     "sagemp train-planner effort=demo --time-limit 600",
 )
 

@@ -6,12 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sagemp_cli.errors import EXIT_CERTIFIED, EXIT_FALSIFIED, EXIT_UNKNOWN, ArtifactError
+from sagemp_cli.errors import ANSWER_CODES, ArtifactError
 
 if TYPE_CHECKING:
     from sagemp_cli.storage import Artifact, Certificate
-
-_CODES = {"VERIFIED": EXIT_CERTIFIED, "FALSIFIED": EXIT_FALSIFIED, "UNKNOWN": EXIT_UNKNOWN}
 
 
 def read_certificate(path: Path) -> Artifact[Certificate]:
@@ -23,21 +21,24 @@ def read_certificate(path: Path) -> Artifact[Certificate]:
     from sagemp_cli.storage import Certificate, read_artifact
 
     artifact = read_artifact(path, Certificate)
-    if artifact.record.verdict not in _CODES:
-        raise ArtifactError(f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(_CODES)}")
+    if artifact.record.verdict not in ANSWER_CODES:
+        raise ArtifactError(
+            f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(ANSWER_CODES)}"
+        )
     return artifact
 
 
 def exit_code(certificate: Artifact[Certificate]) -> int:
     """0 certified, 10 falsified, 5 unknown."""
-    return _CODES[certificate.record.verdict]
+    return ANSWER_CODES[certificate.record.verdict]
 
 
 def as_lines(certificate: Artifact[Certificate]) -> list[str]:
     """The verdict and what decided it, where the files are."""
     data = as_json(certificate)
     what = f"experiment {data['experiment']}, K = {data['horizon']}, {data['propagator']}"
-    counted = f"{data['certified']} of {len(data['references'])} references certified, {data['cells']} cells"
+    cells = f"{data['cells']} cell{'s' * (data['cells'] != 1)}"
+    counted = f"{data['certified']} of {len(data['references'])} references certified, {cells}"
     lines = [f"{data['verdict']}: {counted} ({what}{'' if data['rigorous'] else ', rounding not included'})"]
     for i, item in enumerate(data["references"]):
         if item["verdict"] == "SAFE":
@@ -62,7 +63,8 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
     ]
     lines.append(f"certificate {data['certificate']}")
     if data["verdict"] == "VERIFIED" and not data["checkable"]:
-        lines.append(f"  nobody else can check it: propagator '{data['propagator']}' records no relaxations, 'affine' does")
+        recorded = f"propagator '{data['propagator']}' records no relaxations, 'affine' does"
+        lines.append(f"  nobody else can check it: {recorded}")
     if data["figure"]:
         lines.append(f"figure      {data['figure']}")
     return lines

@@ -8,8 +8,7 @@ import typer
 
 from sagemp_cli.cli.command import examples
 from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
-from sagemp_cli.cli.stage_command import context_of, explain, refuse_existing_output, require_inputs
-from sagemp_cli.cli.time_limit import time_limit as limited
+from sagemp_cli.cli.stage_command import output_of
 
 EXAMPLES = examples(
     "sagemp verify",
@@ -38,29 +37,17 @@ def verify(
     10 falsified, 5 unknown.
     """
     from sagemp_cli.cli import verdict
-    from sagemp_cli.stages.freshness import Freshness, survey
 
     given = overrides_of(overrides, seed=seed, partitions=partitions)
-    context = context_of(given, overwrite=overwrite)
-    states = survey(context)
-    state = states["verify"]
-    known = state.freshness is Freshness.FRESH and not overwrite
-    if not known:
-        refuse_existing_output(state, overwrite)
-        require_inputs(context, states, "verify", given)
-    if dry_run:
-        if known:
-            typer.echo(f"sagemp verify would print the verdict of {state.path}, which is up to date")
-        else:
-            explain(context, states, "verify")
+    made = output_of("verify", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit, shown="the verdict")
+    if made is None:
         return
-    with limited(time_limit):
-        path = state.path if known else state.stage.run(context)
+    path, known = made
     certificate = verdict.read_certificate(path)
     if as_json:
         typer.echo(json.dumps(verdict.as_json(certificate) | {"from_file": known}, indent=2))
     else:
         if known:
-            typer.echo(f"up to date, from the file of {state.header.created_utc if state.header else ''}:")
+            typer.echo(f"up to date, from the file of {certificate.header.created_utc}:")
         typer.echo("\n".join(verdict.as_lines(certificate)))
     raise typer.Exit(verdict.exit_code(certificate))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ class PlanarQuadrotor(Dynamics):
     """``x = [px, pz, phi, vx, vz, omega]``, ``u = [thrust, torque]``.
 
     ``vx' = -(u1/m) sin(phi), vz' = g + (u1/m) cos(phi), omega' = u2 / I_y`` with the paper's ``m = 0.5 kg``,
-    ``g = -9.81 m/s^2`` and ``I_y = 0.01 kg m^2`` as defaults.
+    ``g = -9.81 m/s^2`` and ``I_y = 0.01 kg m^2`` as defaults; ``common`` are the arguments of every robot.
     """
 
     state_names = ("px", "pz", "phi", "vx", "vz", "omega")
@@ -24,24 +26,12 @@ class PlanarQuadrotor(Dynamics):
     def __init__(
         self,
         *,
-        dt: float,
-        control_lower: list[float],
-        control_upper: list[float],
-        state_lower: list[float],
-        state_upper: list[float],
-        disturbance: str = "derivative",
         mass: float = 0.5,
         gravity: float = -9.81,
         inertia: float = 0.01,
+        **common: Any,
     ) -> None:
-        super().__init__(
-            dt=dt,
-            control_lower=control_lower,
-            control_upper=control_upper,
-            state_lower=state_lower,
-            state_upper=state_upper,
-            disturbance=disturbance,
-        )
+        super().__init__(**common)
         self.mass, self.gravity, self.inertia = float(mass), float(gravity), float(inertia)
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:

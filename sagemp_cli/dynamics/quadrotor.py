@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,12 @@ class Quadrotor(Dynamics):
     Accelerations are ``u1/m`` times the third column of ``R_z(psi) R_y(theta) R_x(phi)`` plus gravity. The paper's
     rows for ``pz'`` and ``vy'`` slip; these are the corrected ones: ``pz' = vz`` and
     ``vy' = u1/m (cos(phi) sin(psi) sin(theta) - sin(phi) cos(psi))``.
+
+    Args:
+        mass: kg.
+        gravity: m/s^2, negative.
+        inertia: about the body's axes x, y, z, kg m^2.
+        common: those of every robot.
     """
 
     state_names = ("px", "py", "pz", "psi", "theta", "phi", "vx", "vy", "vz", "p", "q", "r")
@@ -28,24 +35,12 @@ class Quadrotor(Dynamics):
     def __init__(
         self,
         *,
-        dt: float,
-        control_lower: list[float],
-        control_upper: list[float],
-        state_lower: list[float],
-        state_upper: list[float],
-        disturbance: str = "derivative",
         mass: float = 1.0,
         gravity: float = -9.81,
         inertia: Sequence[float] = (0.5, 0.1, 0.3),
+        **common: Any,
     ) -> None:
-        super().__init__(
-            dt=dt,
-            control_lower=control_lower,
-            control_upper=control_upper,
-            state_lower=state_lower,
-            state_upper=state_upper,
-            disturbance=disturbance,
-        )
+        super().__init__(**common)
         if len(inertia) != 3:
             raise ConfigError(f"Quadrotor: inertia needs 3 numbers, found {len(inertia)}")
         self.mass, self.gravity = float(mass), float(gravity)

@@ -47,18 +47,13 @@ class Diffusion(GenerativePlanner):
     """Plans by denoising diffusion; see :class:`~sagemp_cli.planners.generative.GenerativePlanner`.
 
     Args:
-        state_dim: number of states n.
-        horizon: number of steps K.
-        knots: knots M of a plan.
-        width: channels of the network.
-        kernel: knots that a convolution sees, odd.
-        frequencies: features of the noise level.
         levels: noise levels T.
         prediction: what the network is trained to answer, ``"knots"``, ``"v"`` or ``"epsilon"``. The last two have to
             carry the noise through the network, whose errors then stay in the plan; ``"knots"`` gives smoother ones.
         sampler: ``"ddpm"`` (ancestral, all T levels; Ho et al. 2020) or ``"ddim"`` (Song et al. 2021).
         denoising_steps: levels that DDIM visits, spread evenly over T.
         eta: share of DDPM's fresh noise that DDIM adds: 0 is deterministic given the first noise, 1 is ancestral.
+        common: those of every generative planner; the generative time is the noise level over T.
     """
 
     loss_type: ClassVar = DiffusionLoss
@@ -66,21 +61,14 @@ class Diffusion(GenerativePlanner):
     def __init__(
         self,
         *,
-        state_dim: int,
-        horizon: int,
-        knots: int = 20,
-        width: int = 64,
-        kernel: int = 3,
-        frequencies: int = 8,
         levels: int = 100,
         prediction: str = "knots",
         sampler: str = "ddim",
         denoising_steps: int = 20,
         eta: float = 0.0,
+        **common: Any,
     ) -> None:
-        super().__init__(
-            state_dim=state_dim, horizon=horizon, knots=knots, width=width, kernel=kernel, frequencies=frequencies
-        )
+        super().__init__(**common)
         if prediction not in PREDICTIONS:
             raise ConfigError(f"planner: prediction must be one of {PREDICTIONS}, found '{prediction}'")
         if sampler not in SAMPLERS:

@@ -59,33 +59,15 @@ class FlowMatching(GenerativePlanner):
     whatever the method: it lands on the network's answer, and nothing is evaluated at t = 1, where the velocity is 0/0.
 
     Args:
-        state_dim: number of states n.
-        horizon: number of steps K.
-        knots: knots M of a plan.
-        width: channels of the network.
-        kernel: knots that a convolution sees, odd.
-        frequencies: features of the generative time.
         method: ``"euler"``, ``"midpoint"``, ``"heun"`` or ``"rk4"``: one, two, two or four evaluations a step.
         integration_steps: number of steps, the last one included.
+        common: those of every generative planner.
     """
 
     loss_type: ClassVar = FlowMatchingLoss
 
-    def __init__(
-        self,
-        *,
-        state_dim: int,
-        horizon: int,
-        knots: int = 20,
-        width: int = 64,
-        kernel: int = 3,
-        frequencies: int = 8,
-        method: str = "midpoint",
-        integration_steps: int = 10,
-    ) -> None:
-        super().__init__(
-            state_dim=state_dim, horizon=horizon, knots=knots, width=width, kernel=kernel, frequencies=frequencies
-        )
+    def __init__(self, *, method: str = "midpoint", integration_steps: int = 10, **common: Any) -> None:
+        super().__init__(**common)
         if method not in STAGES:
             raise ConfigError(f"planner: method must be one of {tuple(STAGES)}, found '{method}'")
         if integration_steps < 1:

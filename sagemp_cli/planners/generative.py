@@ -57,13 +57,22 @@ class GenerativePlanner(nn.Module, ABC):
         horizon: number of steps K.
         knots: knots M of a plan.
         width: channels of the network, see :class:`~sagemp_cli.planners.temporal_network.TemporalNetwork`.
-        kernel: see there.
-        frequencies: see there.
+        kernel: knots that a convolution sees, odd.
+        frequencies: features of the generative time.
     """
 
     learns_from: ClassVar[str] = "demonstrations"
 
-    def __init__(self, *, state_dim: int, horizon: int, knots: int, width: int, kernel: int, frequencies: int) -> None:
+    def __init__(
+        self,
+        *,
+        state_dim: int,
+        horizon: int,
+        knots: int = 20,
+        width: int = 64,
+        kernel: int = 3,
+        frequencies: int = 8,
+    ) -> None:
         super().__init__()
         if state_dim < 1 or horizon < 1:
             raise ConfigError(f"planner: state_dim and horizon must be positive, found {state_dim} and {horizon}")

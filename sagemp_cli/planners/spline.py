@@ -15,8 +15,7 @@ class Spline(nn.Module):
 
     A network that denoises every row of a trajectory leaves some noise in each, and second differences, which the
     tracker has to follow, amplify it most. A spline through a fifth of the rows cannot be jagged, and the network
-    that generates its knots is five times cheaper. What is lost is what the spline cannot follow: see
-    :meth:`residual`.
+    that generates its knots is five times cheaper. What is lost is what the spline cannot follow.
 
     Both directions are fixed matrices, computed once in float64; they are no weights.
 
@@ -46,7 +45,3 @@ class Spline(nn.Module):
     def rows_of(self, knots: Tensor) -> Tensor:
         """Rows ``(..., K+1, n)``, float64, of the spline through knots ``(..., M, n)``."""
         return self._rows @ knots.to(torch.float64)
-
-    def residual(self, rows: Tensor) -> Tensor:
-        """Largest distance of rows ``(..., K+1, n)`` to their spline, per state ``(n,)``."""
-        return (self.rows_of(self.knots_of(rows)) - rows).abs().flatten(0, -2).amax(0)

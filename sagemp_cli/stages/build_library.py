@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -12,11 +14,11 @@ from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.library import draw_library
-from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import is_whole, key_complaints, number_complaints
 from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_starts import reference_starts
-from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.reference_starts import reference_starts, spread_complaints
 from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Library
 
@@ -24,8 +26,6 @@ from sagemp_cli.storage import Library
 def run(context: StageContext) -> Path:
     """Sample, reject or certify, attack what was certified, write the library."""
     (problem, robot_files), section = trained_problem(context), context.config["library"]
-    wanted = whole_number(section["size"], "library.size")
-    budget = whole_number(section["budget"], "library.budget", least=wanted)
     starts, proof = reference_starts(context.config, problem), Proof.of(context.config, problem)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
@@ -42,8 +42,8 @@ def run(context: StageContext) -> Path:
         lambda references: proof.verify(references, tracker),
         scene=problem.scene,
         position=problem.dynamics.position,
-        wanted=wanted,
-        budget=budget,
+        wanted=section["size"],
+        budget=section["budget"],
         progress=context.progress,
     )
     attack(
@@ -63,9 +63,20 @@ def run(context: StageContext) -> Path:
         reason_names=REASONS,
         reason_counts=np.array(made.counts, dtype=np.int64),
         sampled=made.sampled,
-        wanted=wanted,
+        wanted=section["size"],
         dynamics=robot_files[0].record.weights if robot_files else None,
     )
     path = context.write("build-library", record, (planner_file, tracker_file, *robot_files))
     draw_beside(path, draw_library, context.read("build-library"))
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``library``."""
+    section = config["library"]
+    least = section["size"] if is_whole(section.get("size"), 1) else 1
+    return [
+        *key_complaints(section, "library", ("size", "budget", "start_spread")),
+        *number_complaints(section, "library", size=1, budget=least),
+        *spread_complaints(config),
+    ]

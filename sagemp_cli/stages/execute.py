@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sagemp_cli.execution import execute_queries
 from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.rollouts import draw_rollouts
-from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import key_complaints, number_complaints
 from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.tubes import verification_of
 from sagemp_cli.storage import Rollouts
 
@@ -18,8 +20,6 @@ from sagemp_cli.storage import Rollouts
 def run(context: StageContext) -> Path:
     """Measure starts in X_I, ask the planner, track the closest certified reference, and watch the tube."""
     (problem, robot_files), section = trained_problem(context), context.config["execute"]
-    queries = whole_number(section["queries"], "execute.queries")
-    rollouts = whole_number(section["rollouts"], "execute.rollouts")
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     library_file = context.read("build-library")
     planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
@@ -32,8 +32,8 @@ def run(context: StageContext) -> Path:
         dynamics=problem.dynamics,
         tracker=tracker,
         scene=problem.scene,
-        starts=problem.start.sample(queries, context.generator("execute: starts")),
-        rollouts=rollouts,
+        starts=problem.start.sample(section["queries"], context.generator("execute: starts")),
+        rollouts=section["rollouts"],
         generator=context.generator("execute: disturbances"),
         progress=context.progress,
     )
@@ -51,3 +51,10 @@ def run(context: StageContext) -> Path:
     path = context.write("execute", record, (planner_file, tracker_file, library_file, *robot_files))
     draw_beside(path, draw_rollouts, context.read("execute"), library_file)
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``execute``."""
+    least = {"queries": 1, "rollouts": 1}
+    section = config["execute"]
+    return [*key_complaints(section, "execute", tuple(least)), *number_complaints(section, "execute", **least)]

@@ -12,7 +12,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.stages.stage import STAGES, Stage, StageContext, first_difference, section, stages_of
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.stage import STAGES, Stage, stages_of
 from sagemp_cli.storage import Header, open_header, sha256_of
 from sagemp_cli.storage.kinds import KINDS
 
@@ -82,12 +83,8 @@ def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileStat
 
 
 def _config_change(stage: Stage, header: Header, context: StageContext) -> str:
-    for key in stage.sections:
-        found, wanted = section(header.config, key), section(context.config, key)
-        if found != wanted:
-            where, old, new = first_difference(key, found, wanted)
-            return f"was made with {where}={old}, this config says {new}"
-    return ""
+    different = stage.difference(header.config, context.config)
+    return "was made with {}={}, this config says {}".format(*different) if different else ""
 
 
 def _input_change(stage: Stage, header: Header, context: StageContext, before: Mapping[str, FileState]) -> str:

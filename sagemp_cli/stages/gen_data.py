@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sagemp_cli.binding import option_complaints
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts import (
     Demonstration,
@@ -19,36 +21,30 @@ from sagemp_cli.experts import (
 from sagemp_cli.report.demonstrations import draw_demonstrations
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.scenes.sides import side_label
-from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import number_complaints, without
 from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.problem import problem_of
-from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.storage import Demonstrations
 
+_KEYS = ("count", "processes", "weights")
+"""Keys of ``expert`` that are no options of :class:`Expert`."""
 _FIGURES = ("cost", "optimality", "control_violation", "state_violation", "clearance", "goal_error")
 
 
 def run(context: StageContext) -> Path:
     """Solve the planned problems that are not finished yet, and write them all."""
-    problem, section = problem_of(context.config), dict(context.config["expert"])
-    count = whole_number(section.pop("count", None), "expert.count")
-    processes = whole_number(section.pop("processes", 2), "expert.processes", least=0)
-    weights = Weights(**options_for(Weights, section.pop("weights", None), "expert.weights"))
-    given = ("dynamics", "scene", "horizon", "weights")
-    expert = Expert(
-        problem.dynamics.analytical,
-        problem.scene,
-        problem.horizon,
-        weights,
-        **options_for(Expert, section, "expert", given=given),
-    )
+    problem, section = problem_of(context.config), context.config["expert"]
+    count, options = section["count"], without(section, *_KEYS)
+    weights = Weights(**section["weights"])
+    expert = Expert(problem.dynamics.analytical, problem.scene, problem.horizon, weights, **options)
     problems = plan_demonstrations(problem.start, count, seed=context.seed)
     # A demonstration does not depend on how many there are or who solves it, so these may change between runs.
     partial = PartialResults.of(context, "gen-data", without=("expert.count",))
     done = partial.finished & set(range(count))
     with (
         context.progress.task("demonstrations", count, len(done)) as task,
-        closing(solve_problems(problems, expert, processes=processes, done=done)) as solved,
+        closing(solve_problems(problems, expert, processes=section["processes"], done=done)) as solved,
     ):
         for demonstration in solved:
             partial.save(demonstration.problem.index, _arrays(demonstration))
@@ -58,6 +54,17 @@ def run(context: StageContext) -> Path:
     partial.remove()
     draw_beside(path, draw_demonstrations, context.read("gen-data"))
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``expert``."""
+    section = config["expert"]
+    given = ("dynamics", "scene", "horizon", "weights")
+    return [
+        *number_complaints(section, "expert", count=1, processes=0),
+        *option_complaints(Expert, without(section, *_KEYS), "expert", given=given),
+        *option_complaints(Weights, section.get("weights"), "expert.weights"),
+    ]
 
 
 def _arrays(demonstration: Demonstration) -> dict[str, np.ndarray]:

@@ -1,44 +1,34 @@
-"""Config sections as keyword arguments of functions, checked before anything is computed."""
+"""Complaints about the sections that the stages read key by key; each is one line that names the key."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.errors import did_you_mean
 
 
-def options_for(
-    function: Callable[..., Any], section: Any, where: str, *, given: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """The section's entries if ``function`` takes them all; an option is never silently ignored.
-
-    Args:
-        function: a function or class with keyword arguments.
-        section: mapping of the config, or None for no options.
-        where: name of the section in messages.
-        given: arguments that the stage passes itself, which the section may not set.
-
-    Raises:
-        ConfigError: an unknown or reserved option (with the nearest known one), or a missing one.
-    """
-    options = {} if section is None else section
-    if not isinstance(options, Mapping):
-        raise ConfigError(f"{where} must be a mapping, found {options!r}")
-    parameters = inspect.signature(function).parameters
-    allowed = [k for k in parameters if k not in given]
-    for key in options:
-        if key not in allowed:
-            raise ConfigError(f"{where}.{key}: no such option{did_you_mean(key, allowed)}; known: {', '.join(allowed)}")
-    missing = [k for k in allowed if parameters[k].default is inspect.Parameter.empty and k not in options]
-    if missing:
-        raise ConfigError(f"{where} needs {', '.join(missing)}")
-    return dict(options)
+def without(section: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    """The section's other keys."""
+    return {key: value for key, value in section.items() if key not in keys}
 
 
-def whole_number(value: Any, where: str, *, least: int = 1) -> int:
-    """``value`` if it is a whole number of at least ``least``."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ConfigError(f"{where} must be a whole number of at least {least}, found {value!r}")
-    return value
+def key_complaints(section: Mapping[str, Any], where: str, known: Sequence[str]) -> list[str]:
+    """Keys of a section that nobody reads."""
+    unknown = [str(key) for key in section if key not in known]
+    near = [did_you_mean(key, known) or f"; known: {', '.join(known)}" for key in unknown]
+    return [f"{where}.{key}: no such option{hint}" for key, hint in zip(unknown, near, strict=True)]
+
+
+def number_complaints(section: Mapping[str, Any], where: str, **least: int) -> list[str]:
+    """Keys of a section that are not whole numbers of at least what is said of each."""
+    return [
+        f"{where}.{key} must be a whole number of at least {bound}, found {section.get(key)!r}"
+        for key, bound in least.items()
+        if not is_whole(section.get(key), bound)
+    ]
+
+
+def is_whole(value: Any, least: int) -> bool:
+    """Whether a value is a whole number of at least so much."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least

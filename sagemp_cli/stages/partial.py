@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import os
@@ -11,31 +10,30 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sagemp_cli import __version__
 from sagemp_cli.errors import ResourceError
-from sagemp_cli.stages.stage import StageContext, section, stage_named
-from sagemp_cli.storage import Parent
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.storage import Artifact, Parent
+
+Inputs = Sequence[Artifact[Any] | Parent]
 
 
-def work_identity(
-    context: StageContext, stage: str, *, without: Sequence[str] = (), parents: Sequence[Parent] = ()
-) -> str:
+def work_identity(context: StageContext, stage: str, inputs: Inputs = (), *, without: Sequence[str] = ()) -> str:
     """A hash of everything that a stage's result depends on: its config sections, its inputs and the version.
 
     Args:
         context: gives the config.
         stage: name of the stage.
+        inputs: artifacts and other files that it is made from.
         without: dotted keys that finished pieces do not depend on.
-        parents: inputs.
     """
-    config = {key: copy.deepcopy(section(context.config, key)) for key in stage_named(stage).sections}
-    for dotted in without:
-        key, name = dotted.rsplit(".", 1)
-        (config.get(key) or {}).pop(name, None)
-    data = [__version__, stage, config, sorted((p.role, p.sha256) for p in parents)]
+    config = stage_named(stage).settings(context.config, without=without)
+    data = [__version__, stage, config, sorted((p.role, p.sha256) for p in context.parents(inputs))]
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -51,10 +49,10 @@ class PartialResults:
 
     @classmethod
     def of(
-        cls, context: StageContext, stage: str, *, without: Sequence[str] = (), parents: Sequence[Parent] = ()
+        cls, context: StageContext, stage: str, inputs: Inputs = (), *, without: Sequence[str] = ()
     ) -> PartialResults:
         """Open the pieces of a stage, dropping those that a changed config or input has made stale."""
-        identity = work_identity(context, stage, without=without, parents=parents)
+        identity = work_identity(context, stage, inputs, without=without)
         return cls(_folder_of_its_own(context.partial_folder(stage), identity))
 
     @property
@@ -108,9 +106,9 @@ class PartialFile:
     identity: str
 
     @classmethod
-    def of(cls, context: StageContext, stage: str, *, parents: Sequence[Parent] = ()) -> PartialFile:
+    def of(cls, context: StageContext, stage: str, inputs: Inputs = ()) -> PartialFile:
         """Where the stage's checkpoint is; a checkpoint of other work beside it is removed."""
-        identity = work_identity(context, stage, parents=parents)
+        identity = work_identity(context, stage, inputs)
         results = _folder_of_its_own(context.partial_folder(stage), identity)
         return cls(results / "checkpoint.h5", identity)
 

@@ -13,7 +13,7 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.models import robot_from
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box
-from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.context import StageContext
 from sagemp_cli.storage import Artifact, DynamicsModel
 
 

@@ -18,7 +18,7 @@ from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimens
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.proving import CellProver, Pieces
 from sagemp_cli.reachability.verification import Verification, require_references, verify_references
-from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.options import number_complaints
 from sagemp_cli.stages.problem import Problem
 from sagemp_cli.trackers.policy import Tracker
 
@@ -69,10 +69,13 @@ class Proof:
         """Tubes and verdicts of references ``(R, K+1, n)``.
 
         Raises:
+            ConfigError: the references have another horizon.
             ResourceError: the memory budget is too small.
         """
-        problem = self.problem
+        problem, steps = self.problem, references.shape[1] - 1
         require_references(references, problem.dynamics)
+        if steps != problem.horizon:
+            raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
         prover = CellProver(self.propagator, problem.dynamics, tracker, problem.disturbance)
         found = footprint(prover, references[0], problem.start)
         return verify_references(
@@ -106,10 +109,7 @@ def partition_complaints(section: Mapping[str, Any], uncertain: int) -> list[str
         parse_partitions(section["partitions"], uncertain, auto=True)
     except ConfigError as e:
         found.append(f"verify.{e}")
-    try:
-        whole_number(section["budget"], "verify.budget")
-    except ConfigError as e:
-        found.append(str(e))
+    found += number_complaints(section, "verify", budget=1)
     memory = section["memory"]
     if not isinstance(memory, int | float) or isinstance(memory, bool) or not 0 < memory < float("inf"):
         found.append(f"verify.memory must be a positive number of GiB, found {memory!r}")

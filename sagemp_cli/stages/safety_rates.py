@@ -6,22 +6,23 @@ its controls are played back, when it is tracked, and whether that is certified.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from sagemp_cli.errors import ConfigError
 from sagemp_cli.execution import DISTURBANCES, require_certified_safe, try_references
 from sagemp_cli.execution import Trials as Found
 from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.safety import draw_safety
-from sagemp_cli.stages.options import whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import key_complaints, number_complaints
 from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_starts import reference_starts
-from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.reference_starts import reference_starts, spread_complaints
 from sagemp_cli.storage import SafetyRates, Trials
 
 
@@ -35,20 +36,13 @@ def run(context: StageContext) -> Path:
         SoundnessError: a rollout breaks what was certified; nothing is written.
     """
     (problem, robot_files), section = trained_problem(context), context.config["safety"]
-    count = whole_number(section["references"], "safety.references")
-    rollouts = whole_number(section["rollouts"], "safety.rollouts")
-    within_limits = section["within_limits"]
-    if not isinstance(within_limits, bool):
-        raise ConfigError(f"safety.within_limits must be true or false, found {within_limits!r}")
+    count = section["references"]
     starts, proof = reference_starts(context.config, problem), Proof.of(context.config, problem)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker, generator = tracker_from(tracker_file), context.generator("safety-rates: references")
     references = planner_from(planner_file).sample(
         starts.sample(count, generator), problem.scene.goal, scene=problem.scene, count=count, generator=generator
     )
-    if references.shape[1] != problem.horizon + 1:
-        steps = references.shape[1] - 1
-        raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
     tried = try_references(
         references,
         dynamics=problem.dynamics,
@@ -56,14 +50,14 @@ def run(context: StageContext) -> Path:
         scene=problem.scene,
         start=problem.start,
         disturbance=problem.disturbance,
-        rollouts=rollouts,
+        rollouts=section["rollouts"],
         generator=context.generator("safety-rates: rollouts"),
-        within_limits=within_limits,
+        within_limits=section["within_limits"],
         progress=context.progress,
     )
-    parents = tuple(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file, *robot_files))
+    inputs = (planner_file, tracker_file, *robot_files)
     beside = ("safety.rollouts", "safety.within_limits")  # no piece of the proof depends on them
-    pieces = PartialResults.of(context, "safety-rates", without=beside, parents=parents)
+    pieces = PartialResults.of(context, "safety-rates", inputs, without=beside)
     proved = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     require_certified_safe(proved.safe, tried.closed_loop)
     tubes = [proved.cells_of(r)[1].hull() for r in range(count)]
@@ -83,10 +77,20 @@ def run(context: StageContext) -> Path:
         propagator=proved.propagator,
         rigorous=proved.rigorous,
     )
-    path = context.write("safety-rates", record, (planner_file, tracker_file, *robot_files))
+    path = context.write("safety-rates", record, inputs)
     pieces.remove()
     draw_beside(path, draw_safety, context.read("safety-rates"))
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``safety``, and with where references start."""
+    section = config["safety"]
+    found = key_complaints(section, "safety", ("references", "rollouts", "within_limits"))
+    found += number_complaints(section, "safety", references=1, rollouts=1)
+    if not isinstance(section.get("within_limits"), bool):
+        found.append(f"safety.within_limits must be true or false, found {section.get('within_limits')!r}")
+    return found + spread_complaints(config)
 
 
 def _trials(found: Found) -> Trials:

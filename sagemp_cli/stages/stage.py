@@ -6,39 +6,30 @@ elsewhere. The table :data:`STAGES` is all that ``run``, ``status`` and the comm
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import importlib
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import torch
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from sagemp_cli.binding import target_class
-from sagemp_cli.config import compose
 from sagemp_cli.dynamics.learned import Learned
-from sagemp_cli.errors import ArtifactError, ConfigError
-from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.errors import ConfigError
 from sagemp_cli.storage import (
-    Artifact,
     Certificate,
     Demonstrations,
     DynamicsModel,
-    Header,
     Library,
-    Parent,
     PlannerModel,
     Rollouts,
     SafetyRates,
     TrackerModel,
-    read_artifact,
     refuse_existing,
-    sha256_of,
-    write_artifact,
 )
+
+if TYPE_CHECKING:
+    from sagemp_cli.stages.context import StageContext
 
 
 @dataclass(frozen=True)
@@ -51,6 +42,7 @@ class Stage:
         record: record class of that file.
         inputs: names of the stages whose outputs it reads, where those apply.
         sections: dotted config keys that its output depends on, beyond those of its inputs.
+        irrelevant: keys in these sections that only say where the work is done, and change nothing in the output.
         applies: whether an experiment has this stage at all, from its config.
     """
 
@@ -59,11 +51,26 @@ class Stage:
     record: type
     inputs: tuple[str, ...]
     sections: tuple[str, ...]
+    irrelevant: tuple[str, ...] = ()
     applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
 
     def inputs_in(self, config: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the stages whose outputs it reads in an experiment."""
         return tuple(name for name in self.inputs if stage_named(name).applies(config))
+
+    def settings(self, config: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:
+        """What its output depends on in a config: its sections by their keys, None where one is absent.
+
+        Args:
+            config: resolved config.
+            without: further keys in these sections to leave out.
+        """
+        return {key: _value(config, key, without=(*self.irrelevant, *without)) for key in self.sections}
+
+    def difference(self, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+        """The first dotted key that its output depends on and that differs in two configs, with both values."""
+        before, now = self.settings(found), self.settings(wanted)
+        return next((_difference(key, before[key], now[key]) for key in now if before[key] != now[key]), None)
 
     @property
     def role(self) -> str:
@@ -71,7 +78,11 @@ class Stage:
         return self.output.removesuffix(".h5")
 
     def run(self, context: StageContext) -> Path:
-        """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote."""
+        """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote.
+
+        Raises:
+            ConfigError: another experiment makes the file, or the stage has :meth:`complaints`.
+        """
         owner = context.owner(self.name)
         if owner is not context:
             raise ConfigError(
@@ -79,7 +90,18 @@ class Stage:
                 f"make it with 'sagemp {self.name} experiment={owner.config['name']}'"
             )
         refuse_existing(context.output_path(self.name), context.overwrite)
-        return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}").run(context)
+        wrong = self.complaints(context.config)
+        if wrong:
+            raise ConfigError("; ".join(wrong))
+        return self._module.run(context)
+
+    def complaints(self, config: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the sections that this stage reads and no class is built from, one line each."""
+        return self._module.complaints(config)
+
+    @property
+    def _module(self) -> ModuleType:
+        return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}")
 
 
 def _has_demonstrations(config: Mapping[str, Any]) -> bool:
@@ -103,6 +125,7 @@ STAGES = (
         Demonstrations,
         (),
         (*_ROBOT, "expert", "start", "seed"),
+        irrelevant=("expert.processes",),
         applies=_has_demonstrations,
     ),
     Stage(
@@ -160,9 +183,8 @@ def stage_named(name: str) -> Stage:
 def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "build-library", "execute")) -> list[Stage]:
     """The stages that an experiment's ``last`` ones need, in order, themselves included.
 
-    Those that are not among the default ``last`` ones are made only when they are asked for by name.
-
-    Of a stage whose file another experiment makes, the inputs are that experiment's affair.
+    Those that are not among the default ``last`` ones are made only when they are asked for by name. Of a stage whose
+    file another experiment makes, the inputs are that experiment's affair.
     """
     needed: set[str] = set()
     waiting = list(last)
@@ -175,148 +197,19 @@ def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "bui
     return [stage for stage in STAGES if stage.name in needed]
 
 
-def section(config: Mapping[str, Any], dotted: str) -> Any:
-    """The value of a dotted key, None where it is absent; without what only says where the work is done."""
+def _value(config: Mapping[str, Any], dotted: str, *, without: Sequence[str]) -> Any:
     node: Any = config
     for part in dotted.split("."):
         node = node.get(part) if isinstance(node, Mapping) else None
-    if dotted == "expert" and isinstance(node, Mapping):
-        return {key: value for key, value in node.items() if key != "processes"}
+    if isinstance(node, Mapping):
+        return {key: value for key, value in node.items() if f"{dotted}.{key}" not in without}
     return node
 
 
-@dataclass(frozen=True)
-class StageContext:
-    """What a stage is told: the config, where to read and write, and how to report.
-
-    Attributes:
-        config: resolved config.
-        folder: folder of the experiment's artifacts.
-        overwrite: whether an existing output may be replaced.
-        progress: where to report to.
-        started: for the seconds in the header.
-    """
-
-    config: Mapping[str, Any]
-    folder: Path
-    overwrite: bool = False
-    progress: Progress = field(default_factory=Silent)
-    started: float = field(default_factory=time.monotonic)
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any], **options: Any) -> StageContext:
-        """The context of a config: its folder is ``<artifacts>/<name><effort.suffix>``."""
-        return cls(config, Path(config["artifacts"]) / f"{config['name']}{config['effort']['suffix']}", **options)
-
-    @property
-    def seed(self) -> int:
-        """Root seed."""
-        return int(self.config["seed"])
-
-    def generator(self, purpose: str) -> torch.Generator:
-        """A random generator that depends on the root seed and the purpose only."""
-        digest = hashlib.sha256(f"{self.seed}/{purpose}".encode()).digest()
-        return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
-
-    def owner(self, stage: str) -> StageContext:
-        """The context in which a stage's file is made: this one, or that of the experiment named in ``sources``.
-
-        The other experiment is run as it is in its own file: of this call's overrides it only gets seed, effort,
-        artifacts and device.
-
-        Raises:
-            ConfigError: sources that lead back to where they started.
-        """
-        here, passed = self, [self.config["name"]]
-        while (name := here.config["sources"].get(stage)) is not None:
-            if name in passed:
-                raise ConfigError(f"sources.{stage}: {' -> '.join([*passed, name])} goes in a circle")
-            passed.append(name)
-            shared = {key: here.config[key] for key in ("seed", "artifacts", "device")}
-            options = (f"effort={here.config['effort']['name']}", *(f"{k}={v}" for k, v in shared.items()))
-            other = StageContext.of(_composed((f"experiment={name}", *options)))
-            here = replace(here, config=other.config, folder=other.folder)
-        return here
-
-    def output_path(self, stage: str) -> Path:
-        """Where a stage's output is, in this experiment's folder or in that of the one it comes from."""
-        return self.owner(stage).folder / stage_named(stage).output
-
-    def partial_folder(self, stage: str) -> Path:
-        """Where a long stage keeps finished pieces until its output is written."""
-        return self.folder / f".{stage_named(stage).role}.partial"
-
-    def read(self, stage: str) -> Artifact[Any]:
-        """Read another stage's output and check that it fits this config and its own parents.
-
-        Raises:
-            ArtifactError: missing (names the command that makes it), of another experiment, robot or dt,
-                or made from a parent that has changed since.
-        """
-        owner = self.owner(stage)
-        if owner is not self:
-            artifact = owner.read(stage)
-            if owner.config["horizon"] != self.config["horizon"]:
-                raise ConfigError(
-                    f"sources.{stage}: {owner.config['name']} has horizon {owner.config['horizon']}, "
-                    f"{self.config['name']} has {self.config['horizon']}"
-                )
-            return artifact
-        made_by, path = stage_named(stage), self.output_path(stage)
-        if not path.exists():
-            raise ArtifactError(
-                f"{path}: missing; make it with 'sagemp {stage} experiment={self.config['name']}'"
-                f" (or 'sagemp run', which makes everything that is missing)"
-            )
-        artifact = read_artifact(path, made_by.record)
-        for key in made_by.sections:
-            found, wanted = section(artifact.header.config, key), section(self.config, key)
-            if found != wanted:
-                where, a, b = first_difference(key, found, wanted)
-                raise ArtifactError(
-                    f"{path}: was made with {where}={a}, this config says {b}; "
-                    f"remake it with 'sagemp {stage} --overwrite' or drop the override"
-                )
-        for parent in artifact.header.parents:
-            source = self.folder / parent.path
-            if not source.exists():
-                continue  # an input that is gone cannot contradict what was made from it
-            if sha256_of(source) != parent.sha256:
-                raise ArtifactError(
-                    f"{path}: was made from an earlier {source}, which has changed since; "
-                    f"remake it with 'sagemp {stage} --overwrite'"
-                )
-        return artifact
-
-    def write(
-        self,
-        stage: str,
-        record: Any,
-        parents: tuple[Artifact[Any], ...] = (),
-        files: tuple[Parent, ...] = (),
-    ) -> Path:
-        """Write a stage's output with its provenance: the artifacts and other files that it was made from."""
-        header = Header(
-            stage=stage,
-            experiment=str(self.config["name"]),
-            config=self.config,
-            seed=self.seed,
-            parents=(*(p.as_parent(p.path.stem, self.folder) for p in parents), *files),
-            seconds=time.monotonic() - self.started,
-            device=str(self.config["device"]),
-        )
-        return write_artifact(self.output_path(stage), record, header, overwrite=self.overwrite)
-
-
-@functools.cache
-def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
-    return compose(overrides)
-
-
-def first_difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
-    """The first dotted key at which two config values differ, with both values."""
+def _difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         for k in [*wanted, *(k for k in found if k not in wanted)]:
-            if found.get(k) != wanted.get(k):
-                return first_difference(f"{key}.{k}", found.get(k), wanted.get(k))
+            old, new = found.get(k, "nothing"), wanted.get(k, "nothing")
+            if old != new:
+                return _difference(f"{key}.{k}", old, new)
     return key, found, wanted

@@ -15,13 +15,15 @@ from sagemp_cli.identification import EnclosureWeight, learn_dynamics
 from sagemp_cli.models import curve_of, figures_at_end, weights_of
 from sagemp_cli.report.dynamics import draw_dynamics
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.stages.options import options_for
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import without
 from sagemp_cli.stages.partial import PartialFile
 from sagemp_cli.stages.problem import robot_of
-from sagemp_cli.stages.stage import StageContext
+from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import DynamicsModel
+from sagemp_cli.training import GIVEN_TO_TRAINING
 
-_GIVEN = ("robot", "generator", "checkpoint", "identity", "progress")
+_GIVEN = ("robot", "enclosure", *GIVEN_TO_TRAINING)
 
 
 def run(context: StageContext) -> Path:
@@ -36,20 +38,17 @@ def run(context: StageContext) -> Path:
             f"dynamics: {type(robot).__name__} has nothing to learn; "
             f"choose a learned robot, e.g. dynamics=unicycle_learned"
         )
-    section = dict(context.config["dynamics_training"])
-    enclosure = section.pop("enclosure", None)
-    options = options_for(learn_dynamics, section, "dynamics_training", given=(*_GIVEN, "enclosure"))
-    if enclosure is not None:
-        enclosure = EnclosureWeight(**options_for(EnclosureWeight, enclosure, "dynamics_training.enclosure"))
+    section = context.config["dynamics_training"] or {}
+    enclosure = section.get("enclosure")
     partial = PartialFile.of(context, "train-dynamics")
     history, errors = learn_dynamics(
         robot,
         generator=context.generator("train-dynamics"),
-        enclosure=enclosure,
+        enclosure=None if enclosure is None else EnclosureWeight(**enclosure),
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **options,
+        **without(section, "enclosure"),
     )
     figures = figures_at_end(history) | {"parameters": float(sum(p.numel() for p in robot.parameters()))}
     record = DynamicsModel(
@@ -68,10 +67,14 @@ def run(context: StageContext) -> Path:
     return path
 
 
-def training_complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``dynamics_training`` of a learned robot."""
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``dynamics_training`` of a learned robot; others have none."""
+    if not stage_named("train-dynamics").applies(config):
+        return []
     section = config.get("dynamics_training")
-    plain = {k: v for k, v in section.items() if k != "enclosure"} if isinstance(section, Mapping) else section
-    found = option_complaints(learn_dynamics, plain, "dynamics_training", given=(*_GIVEN, "enclosure"))
-    enclosure = section.get("enclosure") if isinstance(section, Mapping) else None
-    return found + option_complaints(EnclosureWeight, enclosure, "dynamics_training.enclosure")
+    if not isinstance(section, Mapping):
+        return option_complaints(learn_dynamics, section, "dynamics_training", given=_GIVEN)
+    return [
+        *option_complaints(learn_dynamics, without(section, "enclosure"), "dynamics_training", given=_GIVEN),
+        *option_complaints(EnclosureWeight, section.get("enclosure"), "dynamics_training.enclosure"),
+    ]

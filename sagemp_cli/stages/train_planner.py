@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.binding import build
+from sagemp_cli.binding import build, option_complaints, target_class
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.models import curve_of, data_arguments, figures_at_end, weights_of
 from sagemp_cli.planners import (
@@ -26,17 +26,16 @@ from sagemp_cli.planners import (
 )
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.planner import draw_planner
-from sagemp_cli.stages.options import options_for
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import without
 from sagemp_cli.stages.partial import PartialFile
 from sagemp_cli.stages.problem import Problem, problem_of
-from sagemp_cli.stages.stage import StageContext
-from sagemp_cli.storage import Artifact, Parent, PlannerModel, sha256_of
-from sagemp_cli.training import History
+from sagemp_cli.storage import Artifact, Parent, PlannerModel
+from sagemp_cli.training import GIVEN_TO_TRAINING, History
 
 TRAJECTORIES = "trajectories"
 """Role of a file of trajectories among the planner's parents."""
 
-_RUN = ("generator", "checkpoint", "identity", "progress")
 _PLANS = 200
 """Plans that the model card of a planner without demonstrations is about, if it can afford them."""
 
@@ -48,8 +47,7 @@ class _Outcome:
     history: History
     figures: dict[str, float]
     partial: PartialFile | None = None
-    parents: tuple[Artifact[Any], ...] = ()
-    files: tuple[Parent, ...] = ()
+    inputs: tuple[Artifact[Any] | Parent, ...] = ()
 
 
 def run(context: StageContext) -> Path:
@@ -70,31 +68,46 @@ def run(context: StageContext) -> Path:
         figure_names=tuple(figures),
         figures=np.array(list(figures.values())),
     )
-    path = context.write("train-planner", record, outcome.parents, outcome.files)
+    path = context.write("train-planner", record, outcome.inputs)
     if outcome.partial is not None:
         outcome.partial.remove()
     draw_beside(path, draw_planner, context.read("train-planner"))
     return path
 
 
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``planner_training``; where nothing is trained, it is not looked at."""
+    try:
+        planner, section = target_class(config["planner"], "planner"), config["planner_training"]
+    except ConfigError:
+        return []  # the complaint of the section ``planner``
+    learns_from = getattr(planner, "learns_from", None)
+    if learns_from == "demonstrations":
+        share, found = section.get("held_out"), []
+        if not isinstance(share, float) or not 0 < share < 1:
+            found.append(f"planner_training.held_out must be a share in (0, 1), found {share!r}")
+        given = ("planner", "demonstrations", "held_out", "scene", "position", *GIVEN_TO_TRAINING)
+        found += option_complaints(train_planner, without(section, "held_out"), "planner_training", given=given)
+        given = ("planner", "demonstrations", "steps")
+        return found + option_complaints(planner.loss_type, section.get("loss"), "planner_training.loss", given=given)
+    if learns_from == "scenes":
+        given = ("self", "scene", *GIVEN_TO_TRAINING)
+        return option_complaints(planner.learn, section, "planner_training", given=given)
+    if learns_from != "nothing":
+        return [f"planner._target_: {planner.__name__} is no planner: it does not say what it learns from"]
+    return []
+
+
 def _from_demonstrations(context: StageContext, problem: Problem, planner: LearnedPlanner) -> _Outcome:
     """Train on the demonstrations except the last ones, which are held out for the validation curve."""
-    section = dict(context.config["planner_training"])
-    share = section.pop("held_out", 0.1)
-    if not isinstance(share, float) or not 0 < share < 1:
-        raise ConfigError(f"planner_training.held_out must be a share in (0, 1), found {share!r}")
-    given = ("planner", "demonstrations", "held_out", "scene", "position", *_RUN)
-    options = options_for(train_planner, section, "planner_training", given=given)
-    options_for(
-        planner.loss_type, options.get("loss"), "planner_training.loss", given=("planner", "demonstrations", "steps")
-    )
+    section = context.config["planner_training"]
     source = context.read("gen-data")
     states = torch.from_numpy(source.record.states)
-    kept = len(states) - math.ceil(share * len(states))
+    kept = len(states) - math.ceil(section["held_out"] * len(states))
     if kept < 1:
         raise ConfigError(f"{source.path}: {len(states)} demonstrations are too few to hold some out; set expert.count")
     about = {"scene": problem.scene, "position": problem.dynamics.position}
-    partial = PartialFile.of(context, "train-planner", parents=(source.as_parent("demonstrations", context.folder),))
+    partial = PartialFile.of(context, "train-planner", (source,))
     history = train_planner(
         planner,
         states[:kept],
@@ -104,7 +117,7 @@ def _from_demonstrations(context: StageContext, problem: Problem, planner: Learn
         identity=partial.identity,
         progress=context.progress,
         **about,
-        **options,
+        **without(section, "held_out"),
     )
     shown = {f"demonstrated share {label}": s for label, s in sorted(side_shares(states[:kept], **about).items())}
     return _Outcome(history, {"demonstrations": float(kept)} | figures_at_end(history) | shown, partial, (source,))
@@ -112,7 +125,6 @@ def _from_demonstrations(context: StageContext, problem: Problem, planner: Learn
 
 def _from_scenes(context: StageContext, problem: Problem, planner: SelfTaughtPlanner) -> _Outcome:
     """Let the planner make its own lessons; ``planner_training`` are the options of its ``learn``."""
-    options = options_for(planner.learn, context.config["planner_training"], "planner_training", given=("scene", *_RUN))
     partial = PartialFile.of(context, "train-planner")
     history = planner.learn(
         scene=problem.scene,
@@ -120,7 +132,7 @@ def _from_scenes(context: StageContext, problem: Problem, planner: SelfTaughtPla
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **options,
+        **(context.config["planner_training"] or {}),
     )
     return _Outcome(history, figures_at_end(history) | _card(context, problem, planner), partial)
 
@@ -130,11 +142,9 @@ def _as_it_is(context: StageContext, problem: Problem, planner: StoredPlanner) -
     for note in getattr(planner, "notes", ()):
         context.progress.say(f"planner: {note}")
     source: Path | None = getattr(planner, "source", None)
-    files = (
-        () if source is None else (Parent(TRAJECTORIES, os.path.relpath(source, context.folder), sha256_of(source)),)
-    )
+    inputs = () if source is None else (context.source(TRAJECTORIES, source),)
     nothing = History(loss=np.zeros(0), figures={}, validated_at=np.zeros(0, dtype=np.int64), validation={})
-    return _Outcome(nothing, _card(context, problem, planner), files=files)
+    return _Outcome(nothing, _card(context, problem, planner), inputs=inputs)
 
 
 def _card(context: StageContext, problem: Problem, planner: StoredPlanner) -> dict[str, float]:

@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from sagemp_cli.binding import build
+from sagemp_cli.binding import build, option_complaints
 from sagemp_cli.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.training import draw_training
-from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import number_complaints, without
 from sagemp_cli.stages.partial import PartialFile
 from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.storage import TrackerModel
 from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.policy import Tracker
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
+from sagemp_cli.training import GIVEN_TO_TRAINING
 
 
 def run(context: StageContext) -> Path:
     """Train on references of the planner, starts and disturbances of the sets that will be verified."""
-    (problem, robot_files), section = trained_problem(context), dict(context.config["training"])
-    count = whole_number(section.pop("references", None), "training.references")
-    tube = section.pop("tube", None)
-    if tube is not None:
-        tube = TubeLoss(**options_for(TubeLoss, tube, "training.tube"))
-    given = ("tracker", "dynamics", "start", "disturbance", "generator", "tube", "checkpoint", "identity", "progress")
-    options = options_for(train_tracker, section, "training", given=(*given, "references"))
-    options_for(LossWeights, options.get("weights"), "training.weights")
+    (problem, robot_files), section = trained_problem(context), context.config["training"]
+    count, tube = section["references"], section.get("tube")
     extra = data_arguments(context.config["tracker"], "tracker", problem.dynamics, problem.horizon)
     arguments = {key: value for key, value in context.config["tracker"].items() if key != "_target_"} | extra
     with torch.random.fork_rng(devices=[]):  # initial weights depend on the root seed, whatever was drawn before
@@ -45,8 +42,8 @@ def run(context: StageContext) -> Path:
     references = planner.sample(
         problem.start.sample(count, drawing), problem.scene.goal, scene=problem.scene, count=count, generator=drawing
     )
-    parents = tuple(f.as_parent(f.path.stem, context.folder) for f in (planner_file, *robot_files))
-    partial = PartialFile.of(context, "train-tracker", parents=parents)
+    inputs = (planner_file, *robot_files)
+    partial = PartialFile.of(context, "train-tracker", inputs)
     history = train_tracker(
         tracker,
         problem.dynamics,
@@ -54,11 +51,11 @@ def run(context: StageContext) -> Path:
         start=problem.start,
         disturbance=problem.disturbance,
         generator=context.generator("train-tracker"),
-        tube=tube,
+        tube=None if tube is None else TubeLoss(**tube),
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **options,
+        **without(section, "references", "tube"),
     )
     figures = figures_at_end(history)
     record = TrackerModel(
@@ -68,7 +65,19 @@ def run(context: StageContext) -> Path:
         figure_names=tuple(figures),
         figures=np.array(list(figures.values())),
     )
-    path = context.write("train-tracker", record, (planner_file, *robot_files))
+    path = context.write("train-tracker", record, inputs)
     partial.remove()
     draw_beside(path, draw_training, context.read("train-tracker"))
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``training``."""
+    section = config["training"]
+    given = ("tracker", "dynamics", "references", "start", "disturbance", "tube", *GIVEN_TO_TRAINING)
+    return [
+        *number_complaints(section, "training", references=1),
+        *option_complaints(train_tracker, without(section, "references", "tube"), "training", given=given),
+        *option_complaints(LossWeights, section.get("weights"), "training.weights"),
+        *option_complaints(TubeLoss, section.get("tube"), "training.tube"),
+    ]

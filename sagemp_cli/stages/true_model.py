@@ -9,12 +9,12 @@ from typing import Any
 
 from torch import Tensor
 
+from sagemp_cli.binding import options_for
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.affine import Affine
 from sagemp_cli.reachability.deviation import Folded, split
 from sagemp_cli.reachability.partition import parse_partitions, uncertain_dimensions
-from sagemp_cli.stages.options import options_for
 from sagemp_cli.stages.proof import Proof
 from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import TrueModel

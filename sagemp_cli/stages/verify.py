@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.binding import option_complaints
 from sagemp_cli.models import planner_from, tracker_from
 from sagemp_cli.planners.trajectory_file import REFERENCES
 from sagemp_cli.reachability.falsifier import Counterexample as Found
@@ -13,15 +14,17 @@ from sagemp_cli.reachability.refutation import attack
 from sagemp_cli.reachability.verdict import answer_of
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.stages.options import options_for, whole_number
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.options import key_complaints, number_complaints
 from sagemp_cli.stages.partial import PartialResults
 from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.stages.proof import Proof
 from sagemp_cli.stages.reference_file import read_references
-from sagemp_cli.stages.stage import StageContext
 from sagemp_cli.stages.true_model import TrueModelProof
 from sagemp_cli.stages.tubes import tubes_record
-from sagemp_cli.storage import Certificate, Counterexample, Parent, sha256_of
+from sagemp_cli.storage import Artifact, Certificate, Counterexample, Parent
+
+_KEYS = ("partitions", "budget", "memory", "references", "file", "falsifier", "true_model")
 
 
 def run(context: StageContext) -> Path:
@@ -32,32 +35,22 @@ def run(context: StageContext) -> Path:
     (problem, robot_files), section = trained_problem(context), context.config["verify"]
     proof = Proof.of(context.config, problem)
     folded = TrueModelProof.of(section["true_model"], proof) if robot_files else None
-    count = whole_number(section["references"], "verify.references")
-    search = section.get("falsifier") or {}
-    given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
-    search = options_for(attack, search, "verify.falsifier", given=given)
-    for key, value in search.items():
-        whole_number(value, f"verify.falsifier.{key}", least=1 if key == "at_once" else 0)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker = tracker_from(tracker_file)
-    files: tuple[Parent, ...] = ()
+    inputs: tuple[Artifact[Any] | Parent, ...] = (planner_file, tracker_file, *robot_files)
     if section["file"] is None:
         references = planner_from(planner_file).sample(
             problem.start.center,
             problem.scene.goal,
             scene=problem.scene,
-            count=count,
+            count=section["references"],
             generator=context.generator("verify: references"),
         )
-        if references.shape[1] != problem.horizon + 1:
-            found = references.shape[1] - 1
-            raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {found} steps")
     else:
         file = Path(section["file"])
         references = read_references(file, horizon=problem.horizon, state_names=problem.dynamics.state_names)
-        files = (Parent(REFERENCES, os.path.relpath(file, context.folder), sha256_of(file)),)
-    parents = (*(f.as_parent(f.path.stem, context.folder) for f in (planner_file, tracker_file, *robot_files)), *files)
-    pieces = PartialResults.of(context, "verify", without=("verify.falsifier",), parents=parents)
+        inputs = (*inputs, context.source(REFERENCES, file))
+    pieces = PartialResults.of(context, "verify", inputs, without=("verify.falsifier",))
     verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     refutation = attack(
         verification,
@@ -66,7 +59,7 @@ def run(context: StageContext) -> Path:
         scene=problem.scene,
         generator=context.generator("verify: falsifier"),
         progress=context.progress,
-        **search,
+        **(section["falsifier"] or {}),
     )
     record = Certificate(
         tubes=tubes_record(refutation.verification),
@@ -78,10 +71,21 @@ def run(context: StageContext) -> Path:
         dynamics=robot_files[0].record.weights if robot_files else None,
         true_model=folded.verify(references, tracker, context.progress) if folded and verification.safe else None,
     )
-    path = context.write("verify", record, (planner_file, tracker_file, *robot_files), files)
+    path = context.write("verify", record, inputs)
     pieces.remove()
     draw_beside(path, draw_certificate, context.read("verify"))
     return path
+
+
+def complaints(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the section ``verify``, except its partition (see :mod:`sagemp_cli.stages.proof`)."""
+    section, search = config["verify"], config["verify"].get("falsifier")
+    given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
+    wrong = option_complaints(attack, search, "verify.falsifier", given=given)
+    if not wrong:
+        least = {key: 1 if key == "at_once" else 0 for key in search or {}}
+        wrong = number_complaints(search or {}, "verify.falsifier", **least)
+    return [*key_complaints(section, "verify", _KEYS), *number_complaints(section, "verify", references=1), *wrong]
 
 
 def _counterexample(reference: int, found: Found) -> Counterexample:

@@ -64,7 +64,7 @@ def test_ctrl_c_ends_with_its_code_leaves_no_artifact_and_the_same_command_goes_
     finally:
         process.kill()
     assert process.returncode == EXIT_INTERRUPTED
-    assert stderr.splitlines()[-1].startswith("interrupted: nothing half-written is left, finished pieces are kept")
+    assert stderr.splitlines()[-1].startswith("interrupted: nothing half-written is left; run the same command again")
     assert [p.name for p in folder.iterdir()] == [".demonstrations.partial"]
     subprocess.run(command, check=True, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert sorted(p.name for p in folder.iterdir()) == ["demonstrations.h5", "demonstrations.png"]

@@ -10,6 +10,7 @@ import pytest
 
 COMMANDS = [
     ["gen-data"],
+    ["train-dynamics"],
     ["train-planner"],
     ["train-tracker"],
     ["verify"],
@@ -17,6 +18,7 @@ COMMANDS = [
     ["execute"],
     ["safety-rates"],
     ["run"],
+    ["check"],
     ["status"],
     ["inspect"],
     ["doctor"],
@@ -43,6 +45,7 @@ def test_the_help_lists_every_command(sagemp):
 
 def test_examples_in_the_help_show_brackets_as_typed(sagemp):
     assert "'tracker.hidden=[8,8]'" in sagemp("train-tracker", "--help").stdout
+    assert "jq '.files[].state'" in sagemp("status", "--help").stdout
 
 
 def test_help_imports_nothing_heavy_and_comes_at_once():

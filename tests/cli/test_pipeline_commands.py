@@ -172,6 +172,18 @@ def test_a_dry_run_says_what_would_be_read_and_written(sagemp, made_up):
         f"  write    {FOLDER}/certificate.h5",
     ]
     assert made_up.ran == []
+    sagemp("verify")
+    replacing = sagemp("verify", "--overwrite", "--dry-run").stdout.splitlines()
+    assert replacing[-1] == f"  replace  {FOLDER}/certificate.h5"
+
+
+def test_status_names_the_command_that_makes_a_missing_file_as_it_has_to_be_typed(sagemp):
+    files = json.loads(sagemp("status", "--json", "effort=toy", "--seed", "3").stdout)["files"]
+    assert [f["why"] for f in files] == [f"make it with 'sagemp {name} effort=toy seed=3'" for name in NAMES]
+    files = json.loads(sagemp("status", "--json", "experiment=planar_cfm").stdout)["files"]
+    found = {f["stage"]: f["why"] for f in files}
+    assert found["train-planner"] == "make it with 'sagemp train-planner experiment=planar_cfm'"
+    assert found["train-tracker"] == "make it with 'sagemp train-tracker experiment=planar_node'"
 
 
 def test_an_input_of_another_config_is_refused_and_the_key_named(sagemp, made_up):
@@ -279,3 +291,12 @@ def test_inspect_shows_kind_provenance_fields_and_verdicts(sagemp, made_up):
     assert found["verdicts"][0] == "VERIFIED"
     sagemp("train-planner", "--overwrite")
     assert "planner.h5 (changed since)" in sagemp("inspect", FOLDER / "certificate.h5").stdout
+
+
+def test_inspect_says_whether_the_content_is_what_was_written(sagemp, made_up):
+    sagemp("run", "--until", "verify")
+    path = FOLDER / "certificate.h5"
+    assert "as it was written" in sagemp("inspect", path).stdout
+    with h5py.File(path, "a") as file:
+        file["data/tubes/clearance"][...] = 9.0
+    assert "CHANGED since it was written" in sagemp("inspect", path).stdout

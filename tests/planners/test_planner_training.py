@@ -5,7 +5,7 @@ import torch
 
 from sagemp_cli.errors import ConfigError, NonFiniteError, UsageError
 from sagemp_cli.planners import NeuralODE, train_planner
-from sagemp_cli.planners.neural_ode_loss import NeuralODELoss
+from sagemp_cli.planners.neural_ode import NeuralODELoss
 
 POSITION, HORIZON = (0, 1), 40
 

@@ -19,7 +19,6 @@ def test_cubics_come_back_from_their_knots(knots):
     spline, x = Spline(horizon=50, knots=knots), rows()
     assert spline.knots_of(x).shape == (3, knots, 2)
     assert torch.allclose(spline.rows_of(spline.knots_of(x)), x, atol=1e-11)
-    assert spline.residual(x).max() < 1e-11
 
 
 def test_knots_are_the_values_of_the_trajectory_at_their_times():
@@ -37,7 +36,7 @@ def test_row_0_is_kept_and_the_other_rows_are_fitted():
         moved = knots.clone()
         moved[:, i] += 1e-3
         assert (spline.rows_of(moved) - noisy).square().sum() > best
-    assert spline.residual(noisy).min() > 0.05
+    assert (spline.rows_of(knots) - noisy).abs().amax((0, 1)).min() > 0.05
 
 
 def test_as_many_knots_as_rows_lose_nothing():

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from sagemp_cli.config import compose
-from sagemp_cli.stages.stage import StageContext, stage_named
+from sagemp_cli.stages.context import StageContext
+from sagemp_cli.stages.stage import stage_named
 
 
 def assert_same(a: Any, b: Any) -> None:

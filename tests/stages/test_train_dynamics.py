@@ -11,9 +11,10 @@ from sagemp_cli.cli import verdict
 from sagemp_cli.config import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.models import robot_from, tracker_from
+from sagemp_cli.stages.context import StageContext
 from sagemp_cli.stages.problem import problem_of, robot_of, trained_problem
 from sagemp_cli.stages.requirements import require_sound_config
-from sagemp_cli.stages.stage import StageContext, stage_named
+from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import DynamicsModel, read_artifact
 
 EXPERIMENT = ("experiment=unicycle_node_learned", "effort=toy", "dynamics.hidden=[16,16]")

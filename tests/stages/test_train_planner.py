@@ -8,10 +8,11 @@ from sagemp_cli.config import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.models import planner_from
 from sagemp_cli.planners import NeuralODE
+from sagemp_cli.stages.context import StageContext
 from sagemp_cli.stages.freshness import Freshness, survey
 from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.stages.requirements import require_sound_config
-from sagemp_cli.stages.stage import StageContext, stage_named
+from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import PlannerModel, read_artifact, sha256_of
 from sagemp_cli.training import History
 
@@ -156,7 +157,7 @@ def test_options_of_a_planner_that_teaches_itself_are_those_of_its_own(tmp_path,
     context = context_of(tmp_path, "neural_ode", drop=(), training={"round": 4})
     with pytest.raises(ConfigError, match=r"round: learn has no such option \(did you mean 'rounds'\?"):
         require_sound_config(context.config)
-    with pytest.raises(ConfigError, match="planner_training.round: no such option"):
+    with pytest.raises(ConfigError, match="planner_training.round: learn has no such option"):
         stage_named("train-planner").run(context)
 
 

@@ -20,6 +20,9 @@ from sagemp_cli.scenes.scene import Scene
 OVER_WEIGHT = 5.0
 """A thing covers few cells of a map, so each counts more."""
 
+SPACING = 0.01
+"""Of the places on a way that are looked at, in a square of side 2."""
+
 
 @dataclass(frozen=True)
 class Lessons:
@@ -96,10 +99,10 @@ def answer_figures(reader: SceneReader, exercises: Sequence[Exercise], *, seed: 
     return figures | ({"passes over": float(np.mean(over))} if over else {})
 
 
-def along(corners: np.ndarray, spacing: float = 0.01) -> np.ndarray:
-    """Places on a polyline ``(C, 2)``, at most ``spacing`` apart."""
+def along(corners: np.ndarray) -> np.ndarray:
+    """Places on a polyline ``(C, 2)``, at most :data:`SPACING` apart."""
     pieces = []
     for a, b in zip(corners[:-1], corners[1:], strict=True):
-        count = max(2, int(np.ceil(np.linalg.norm(b - a) / spacing)) + 1)
+        count = max(2, int(np.ceil(np.linalg.norm(b - a) / SPACING)) + 1)
         pieces.append(a + np.linspace(0, 1, count)[:, None] * (b - a))
     return np.concatenate(pieces)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.binding import option_complaints
+from sagemp_cli.binding import options_for
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.vlm.answer import MOST_WAYPOINTS, AnswerError, waypoints_of
@@ -36,6 +36,8 @@ from sagemp_cli.training import History, fit
 PROVIDERS = ("local", "gemini", "openai", "replay")
 SERVICE_PLANS = 4
 """Plans that are asked of a service for model cards and figures, where others give hundreds."""
+_SHOWN = 32
+"""Starts from which the stand-in is tried in the experiment's own scene."""
 
 
 class Provider(Protocol):
@@ -116,13 +118,15 @@ class VLM(nn.Module):
         self.state_dim, self.horizon, self.dt = int(state_dim), int(horizon), float(dt)
         self.provider_name, self.prompt, self.recording = provider, prompt, recording
         self.attempts, self.most_waypoints, self.diversity = int(attempts), int(most_waypoints), float(diversity)
-        self.drive = _options(Drive, drive, "planner.drive")
-        self.service = _options(ServiceOptions, service, "planner.service")
+        self.drive = Drive(**options_for(Drive, drive, "planner.drive"))
+        self.service = ServiceOptions(**options_for(ServiceOptions, service, "planner.service"))
         self.learns_from = "scenes" if provider == "local" else "nothing"
         if provider in ("gemini", "openai"):
             self.affordable_plans = SERVICE_PLANS
         self.network = dict(network or {})
-        self.reader = _options(SceneReader, network, "planner.network") if provider == "local" else None
+        self.reader = (
+            SceneReader(**options_for(SceneReader, network, "planner.network")) if provider == "local" else None
+        )
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -283,12 +287,12 @@ class VLM(nn.Module):
             description="training the stand-in for a VLM",
         )
 
-    def _figures_in(self, scene: Scene, reader: SceneReader, seed: int, count: int = 32) -> dict[str, float]:
+    def _figures_in(self, scene: Scene, reader: SceneReader, seed: int) -> dict[str, float]:
         """Shares of references in a scene that keep clear, and that pass over the landmark that the prompt names."""
         frame, generator = Frame.of(scene.workspace), torch.Generator().manual_seed(seed % 2**31)
-        unit = torch.rand(16 * count, 2, generator=generator, dtype=torch.float64).numpy()
+        unit = torch.rand(16 * _SHOWN, 2, generator=generator, dtype=torch.float64).numpy()
         places = torch.from_numpy(frame.to_workspace(np.array([-0.95, -0.7]) + unit * np.array([0.35, 1.4])))
-        places = places[scene.signed_distance(places) > 0.1 * frame.scale][:count]
+        places = places[scene.signed_distance(places) > 0.1 * frame.scale][:_SHOWN]
         if len(places) == 0:
             return {}
         starts = torch.zeros(len(places), self.state_dim, dtype=torch.float64)
@@ -304,14 +308,6 @@ class VLM(nn.Module):
                 apart = torch.linalg.vector_norm(paths - torch.tensor(landmark.center), dim=-1)
                 figures[f"passes over {landmark.name}"] = float((apart.amin(-1) < landmark.radius).double().mean())
         return figures
-
-
-def _options(cls: type, options: Mapping[str, Any] | None, where: str) -> Any:
-    """An options object from plain data; complaints name the key."""
-    wrong = option_complaints(cls, options, where)
-    if wrong:
-        raise ConfigError("; ".join(wrong))
-    return cls(**(options or {}))
 
 
 def _middle_of(goal: Box) -> np.ndarray:

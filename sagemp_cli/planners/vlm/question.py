@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sagemp_cli.scenes.frame import Frame
-from sagemp_cli.scenes.render import Image, png_bytes, render
+from sagemp_cli.scenes.render import png_bytes, render
 from sagemp_cli.scenes.scene import Scene
 
 
@@ -30,10 +30,6 @@ class Question:
     start: NDArray[np.float64]
     goal: NDArray[np.float64]
 
-    def image(self, height: int, frame: Frame | None = None) -> Image:
-        """The picture ``(height, width, 3)``, by default in the question's own frame."""
-        return render(self.scene, frame or self.frame, start=self.start, goal=self.goal, height=height)
-
     def png(self, height: int) -> bytes:
-        """The picture as a PNG file."""
-        return png_bytes(self.image(height))
+        """The picture as a PNG file of so many rows."""
+        return png_bytes(render(self.scene, self.frame, start=self.start, goal=self.goal, height=height))

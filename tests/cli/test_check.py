@@ -1,0 +1,36 @@
+"""What ``sagemp check`` prints of each kind of answer."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from sagemp_cli.checker.check import Finding, Report
+from sagemp_cli.cli.check import as_lines
+
+
+def report(answer, *claims):
+    """A report about references of which each is claimed to be as given, none of them proved."""
+    fields = {f.name: None for f in dataclasses.fields(Finding)}
+    findings = tuple(
+        Finding(**fields | {"reference": i, "claimed": claim, "proved": False, "reason": "some reason"})
+        for i, claim in enumerate(claims)
+    )
+    fields = {f.name: None for f in dataclasses.fields(Report)}
+    known = {"path": Path("c.h5"), "answer": answer, "claimed": answer, "problems": (), "findings": findings}
+    return Report(**fields | known | {"cells": 4, "horizon": 5, "seconds": 1.0, "proof_seconds": 0.0})
+
+
+def test_a_proved_counterexample_is_called_proved():
+    lines = as_lines(report("FALSIFIED", "UNSAFE", "MAY_COLLIDE"))
+    assert lines[1:3] == [
+        "  reference 0: UNSAFE: its counterexample is proved",
+        "  reference 1: MAY_COLLIDE: some reason",
+    ]
+
+
+@pytest.mark.parametrize("claim", ["UNSAFE", "MAY_COLLIDE"])
+def test_a_counterexample_that_is_not_proved_is_not_called_so(claim):
+    assert as_lines(report("UNKNOWN", claim))[1] == f"  reference 0: {claim}: some reason"
