@@ -17,8 +17,7 @@ from sagemp_cli.checker.cell import Policy
 from sagemp_cli.checker.limits import require_readable
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.storage.content import ContentError, content_hash
-
-_LONGEST_CONFIG = 100_000
+from sagemp_cli.storage.plain_yaml import plain_yaml
 
 KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
 """Schemas that can be checked, with the newest version of their format that is known here."""
@@ -129,21 +128,9 @@ def _read(file: h5py.File, path: Path) -> Document:
     return dataclasses.replace(document, true_model=dataclasses.replace(true, deviation=deviation))
 
 
-class _Plain(yaml.SafeLoader):
-    """Plain data with everything written out. Not the loader in C: deep nesting ends the process there."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """A node; an alias, by which a short text unfolds to any size, is refused."""
-        if self.check_event(yaml.AliasEvent):
-            raise ValueError("its config holds an alias")
-        return super().compose_node(parent, index)
-
-
 def _config(text: str) -> Any:
     """What the config says, if that can be read in one way only: no key twice, no number such as ``010`` (8)."""
-    if len(text) > _LONGEST_CONFIG:
-        raise ValueError(f"its config has {len(text)} characters, more than {_LONGEST_CONFIG}")
-    config = yaml.load(text, Loader=_Plain)
+    config = plain_yaml(text)
     if yaml.safe_dump(config, sort_keys=True) != text:
         raise ValueError("its config is not written as sagemp writes it, and could be misread")
     return config

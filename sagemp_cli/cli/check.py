@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import Json
 from sagemp_cli.errors import ANSWER_CODES
 
@@ -39,7 +39,7 @@ def check(
 
     torch.set_num_threads(1)
     report = prove(file, processes=processes, progress=console_progress())
-    typer.echo(json.dumps(as_data(report), indent=2) if as_json else "\n".join(as_lines(report)))
+    typer.echo(json.dumps(as_data(report), indent=2) if as_json else printable("\n".join(as_lines(report))))
     raise typer.Exit(ANSWER_CODES[report.answer])
 
 

@@ -55,7 +55,12 @@ def flowing(function: Callable[..., Any]) -> str:
     return "\n\n".join(" ".join(p.split()) for p in paragraphs)
 
 
+def printable(text: str) -> str:
+    """Text of somebody else's file without what a terminal would obey, such as escape sequences."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def _complain(line: str) -> None:
     if os.environ.get("SAGEMP_DEBUG", "") not in ("", "0"):
         traceback.print_exc()
-    typer.echo(" ".join(line.split()), err=True)
+    typer.echo(printable(" ".join(line.split())), err=True)

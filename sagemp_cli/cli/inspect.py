@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import Json
 
 if TYPE_CHECKING:
@@ -135,7 +135,10 @@ def _verdicts(record: Any) -> list[str]:
 def _print(content: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
-    from rich.text import Text
+    from rich.text import Text as Styled
+
+    def text(value: str, style: str = "") -> Styled:
+        return Styled(printable(value), style=style)
 
     console = Console()
     if not console.is_terminal:
@@ -144,16 +147,16 @@ def _print(content: dict[str, Any]) -> None:
     keys = ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256")
     for key in (*keys, "content"):
         value = content[key]
-        facts.add_row(Text(key, style="bold"), Text(f"{value:.1f}" if isinstance(value, float) else str(value)))
-    facts.add_row(Text("packages", style="bold"), Text(", ".join(f"{k} {v}" for k, v in content["packages"].items())))
+        facts.add_row(text(key, style="bold"), text(f"{value:.1f}" if isinstance(value, float) else str(value)))
+    facts.add_row(text("packages", style="bold"), text(", ".join(f"{k} {v}" for k, v in content["packages"].items())))
     for parent in content["parents"]:
-        facts.add_row(Text("made from", style="bold"), Text(f"{parent['file']} ({parent['now']})"))
+        facts.add_row(text("made from", style="bold"), text(f"{parent['file']} ({parent['now']})"))
     for line in content["verdicts"]:
-        facts.add_row(Text("verdict", style="bold"), Text(line))
+        facts.add_row(text("verdict", style="bold"), text(line))
     console.print(facts)
     table = Table(box=None, padding=(0, 2, 0, 0))
     for column in ("name", "holds", "dims", "units", "doc"):
         table.add_column(column, overflow="fold")
     for row in content["fields"]:
-        table.add_row(*(Text(row[c]) for c in ("name", "holds", "dims", "units", "doc")))
+        table.add_row(*(text(row[c]) for c in ("name", "holds", "dims", "units", "doc")))
     console.print(table)

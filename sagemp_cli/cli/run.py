@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import DryRun, Overrides, Partitions, Seed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import announce, context_of
 from sagemp_cli.cli.time_limit import time_limit as limited
@@ -61,7 +61,7 @@ def run(
     if dry_run or "verify" not in [stage.name for stage in wanted]:
         return
     certificate = verdict.read_certificate(context.output_path("verify"))
-    typer.echo("\n".join(verdict.as_lines(certificate)))
+    typer.echo(printable("\n".join(verdict.as_lines(certificate))))
     raise typer.Exit(verdict.exit_code(certificate))
 
 

@@ -6,7 +6,7 @@ import json
 
 import typer
 
-from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import output_of
 
@@ -49,5 +49,5 @@ def verify(
     else:
         if known:
             typer.echo(f"up to date, from the file of {certificate.header.created_utc}:")
-        typer.echo("\n".join(verdict.as_lines(certificate)))
+        typer.echo(printable("\n".join(verdict.as_lines(certificate))))
     raise typer.Exit(verdict.exit_code(certificate))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
+import h5py
 import pytest
 
 from sagemp_cli.checker.check import Finding, Report
 from sagemp_cli.cli.check import as_lines
+from sagemp_cli.storage.content import content_hash
 
 
 def report(answer, *claims):
@@ -34,3 +37,14 @@ def test_a_proved_counterexample_is_called_proved():
 @pytest.mark.parametrize("claim", ["UNSAFE", "MAY_COLLIDE"])
 def test_a_counterexample_that_is_not_proved_is_not_called_so(claim):
     assert as_lines(report("UNKNOWN", claim))[1] == f"  reference 0: {claim}: some reason"
+
+
+def test_what_a_terminal_would_obey_is_not_printed(sagemp, toy_folder, tmp_path):
+    path = tmp_path / "certificate.h5"
+    shutil.copy(toy_folder / "certificate.h5", path)
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["verdict"] = "\x1b[2J\x1b[1;1HVERIFIED"
+        file.attrs["content_sha256"] = content_hash(file)
+    for command in ("check", "inspect"):
+        result = sagemp(command, path)
+        assert "VERIFIED" in result.output and "\x1b" not in result.output

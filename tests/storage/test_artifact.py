@@ -195,3 +195,22 @@ def test_random_damage_never_escapes_as_anything_but_a_one_line_error(example, t
             assert str(path) in str(e)
             assert "\n" not in str(e)
     assert refused > 15
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ("a: " + 60_000 * "[" + 60_000 * "]", "more than 100000"),
+        ("a: " + 40_000 * "[" + 40_000 * "]", "damaged"),
+        ("a: &b [1, 2]\nc: *b\n", "alias"),
+        ("a: !!python/object/apply:os.getcwd []\n", "damaged"),
+    ],
+    ids=["too long", "too deep", "alias", "object"],
+)
+def test_a_config_that_is_more_than_plain_data_is_refused(config, message, example, tmp_path):
+    path = write_artifact(tmp_path / "certificate.h5", example(Certificate), HEADER)
+    with h5py.File(path, "r+") as file:
+        del file["config"]
+        file.create_dataset("config", data=config, dtype=h5py.string_dtype())
+    with pytest.raises(ArtifactError, match=message):
+        open_header(path)
