@@ -65,7 +65,7 @@ def read_document(path: Path) -> Document:
             anything missing or of the wrong type or shape.
     """
     if not path.is_file():
-        raise ArtifactError(f"{path}: no such file")
+        raise ArtifactError(f"{path}: {'is a folder, a file is needed' if path.is_dir() else 'no such file'}")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             require_readable(file, path.stat().st_size)

@@ -211,7 +211,8 @@ def _require_keys(where: str, data: Any, needed: Sequence[str], allowed: Sequenc
         raise ConfigError(f"{where} must be a mapping with {', '.join(needed)}, found {data!r}")
     for key in data:
         if key not in needed and key not in allowed:
-            raise ConfigError(f"{where}: unknown key '{key}'{did_you_mean(str(key), (*needed, *allowed))}")
+            near = did_you_mean(str(key), (*needed, *allowed)) or f"; known: {', '.join((*needed, *allowed))}"
+            raise ConfigError(f"{where}: unknown key '{key}'{near}")
     for key in needed:
         if key not in data:
             raise ConfigError(f"{where}: key '{key}' is missing")

@@ -232,6 +232,8 @@ def test_a_file_cut_off_at_any_place_is_refused(certificate, tmp_path):
             check(path)
     with pytest.raises(ArtifactError, match="no such file"):
         check(tmp_path / "none.h5")
+    with pytest.raises(ArtifactError, match="is a folder, a file is needed"):
+        check(tmp_path)
 
 
 def test_the_command_says_what_was_proved(certificate, tmp_path):

@@ -135,7 +135,7 @@ def changed(path, value):
         (changed(["obstacles", 0, "radius"], -1), "scene.obstacles[0].radius must be a positive number, found -1"),
         (changed(["obstacles", 0, "radius"], "wide"), "scene.obstacles[0].radius must be a list of numbers"),
         (changed(["obstacles", 0, "radius"], float("inf")), "scene.obstacles[0].radius must be finite"),
-        (changed(["obstacles", 0, "colour"], "red"), "scene.obstacles[0]: unknown key 'colour'"),
+        (changed(["obstacles", 0, "colour"], "red"), "scene.obstacles[0]: unknown key 'colour'; known: "),
         (changed(["obstacles", 0, "center"], [0]), "scene.obstacles[0].center needs 2 numbers, found 1"),
         (changed(["obstacles", 1, "lower"], [3, 0]), "scene.obstacles[1]: lower must lie below upper"),
     ],
