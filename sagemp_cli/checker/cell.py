@@ -87,18 +87,17 @@ def prove_cell(claim: CellClaim, dynamics: Dynamics, policy: Policy) -> str:
         try:
             loop = Loop(dynamics, policy, claim.reference)
             w = balls(claim.disturbance_lower), balls(claim.disturbance_upper)
-            states = Zonotope.box(claim.lower, claim.upper)
+            states, matrices = Zonotope.box(claim.lower, claim.upper), {}
             if not ((claim.tube_lower[k] <= claim.lower) & (claim.upper <= claim.tube_upper[k])).all():
                 raise Unproved("the tube does not contain the cell")
             for k in range(claim.begin, claim.end):
-                step = Step(states, *w, record=_record(claim, k))
+                step = Step(states, *w, record=_record(claim, k), matrices=matrices)
                 x = step.state()
                 u = loop.control(step, k, x)
                 asked = loop.within(step.bounds(u.rows()))
                 _require_inside(asked, claim.control_lower[k], claim.control_upper[k], "control")
                 after = _after(claim, dynamics, step, k, x, u)
-                step.finish()
-                states = states.image(after.rows())
+                states = states.image(step.finish(after))
                 if claim.kept is not None:
                     states = states.reduced(_mask(claim.kept[k], states.generators.shape[1]))
                 _require_inside(states.bounds(), claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")

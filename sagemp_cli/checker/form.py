@@ -14,19 +14,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.checker.balls import Unproved, arb, arb_mat, ball
+from sagemp_cli.checker.balls import Unproved, arb, arb_mat, ball, balls
 from sagemp_cli.checker.functions import FUNCTIONS, Function, clamp, elu, integer_power, leaky_relu, softplus
 from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.errors import UnsupportedOperationError
 
 _UNDERFLOW = 2.0**-800  # a recorded radius may be 0 instead; what goes on is the radius found here
 
+_ZERO = arb(0)
+
 Entry = tuple[float, float, float]
 """A recorded relaxation: slope (of a product the scale), offset and radius."""
 
 
 class Scalar:
-    """One number of a form."""
+    """One number of a form; its row ends where only zeros would follow."""
 
     __slots__ = ("row",)
 
@@ -34,7 +36,8 @@ class Scalar:
         self.row = row
 
     def __add__(self, other: Scalar) -> Scalar:
-        return Scalar(self.row + other.row)
+        width = max(self.row.ncols(), other.row.ncols())
+        return Scalar(_padded(self.row, width) + _padded(other.row, width))
 
     def times(self, factor: arb) -> Scalar:
         """The multiple by a number."""
@@ -48,6 +51,7 @@ class Step:
         states: the set at the beginning of the step; None evaluates at a point, without relaxations.
         lower, upper: W, exact.
         record: recorded operations in order: name and entries.
+        matrices: constant matrices of the steps before, by the tensor's id.
     """
 
     def __init__(
@@ -56,12 +60,14 @@ class Step:
         lower: Sequence[arb],
         upper: Sequence[arb],
         record: Sequence[tuple[str, Sequence[Entry]]] = (),
+        matrices: dict[int, tuple[torch.Tensor, arb_mat]] | None = None,
     ) -> None:
         self.states = states
+        self._matrices = {} if matrices is None else matrices
         self._record = iter(record)
         begin = 1 if states is None else 1 + len(states.center)
-        self._next = begin + len(lower)
-        self.width = self._next + sum(len(entries) for _, entries in record)
+        self._first = self._next = begin + len(lower)  # column of the first relaxation, of the next one
+        self._width = self._next + sum(len(entries) for _, entries in record)
         scalars = []
         for i, (a, b) in enumerate(zip(lower, upper, strict=True)):
             scalar = self.constant((a + b) / 2)
@@ -71,7 +77,7 @@ class Step:
 
     def constant(self, value: arb) -> Scalar:
         """A number that depends on nothing."""
-        row = arb_mat(1, self.width)
+        row = arb_mat(1, self._first)
         row[0, 0] = value
         return Scalar(row)
 
@@ -93,23 +99,26 @@ class Step:
 
     def relax(self, name: str, function: Function, rows: arb_mat) -> arb_mat:
         """``function`` of the value of every row."""
-        return self.joined(self._relaxed(name, function, self._scalars(rows), rows))
+        if self.states is None:
+            return self.joined([self.constant(function.value(rows[i, 0])) for i in range(rows.nrows())])
+        slopes, found = [], []
+        entries = self._take(name, rows.nrows())
+        for (lower, upper), entry in zip(self.bounds(rows), entries, strict=True):
+            slopes.append(ball(entry[0]))
+            found.append(function.excess(slopes[-1], lower, upper))
+        flat, width, wider = rows.entries(), rows.ncols(), self._next + rows.nrows()
+        scaled: list[arb] = []
+        for i, slope in enumerate(slopes):
+            scaled += [a * slope for a in flat[i * width : (i + 1) * width]]
+            scaled += [_ZERO] * (wider - width)
+        out = arb_mat(len(slopes), wider, scaled)
+        for i, ((least, most), entry) in enumerate(zip(found, entries, strict=True)):
+            self._put(name, out, i, least, most, entry)
+        return out
 
     def apply(self, name: str, function: Function, x: Form) -> Form:
         """``function`` of every entry of a form."""
-        return Form(self, array_of(self._relaxed(name, function, list(x.values.flat), x.rows()), x.shape))
-
-    def _relaxed(self, name: str, function: Function, scalars: Sequence[Scalar], rows: arb_mat) -> list[Scalar]:
-        """``function`` of every number, which are the rows of a matrix."""
-        if self.states is None:
-            return [self.constant(function.value(s.row[0, 0])) for s in scalars]
-        entries, out = self._take(name, len(scalars)), []
-        for scalar, (lower, upper), entry in zip(scalars, self.bounds(rows), entries, strict=True):
-            slope = ball(entry[0])
-            least, most = function.excess(slope, lower, upper)
-            out.append(scalar.times(slope))
-            self._put(name, out[-1].row, 0, least, most, entry)
-        return out
+        return self.split(self.relax(name, function, x.rows()), x.shape)
 
     def product(self, a: Form, b: Form) -> Form:
         """Product of forms whose deviations X and Y may be correlated: ``X Y = (P^2 - M^2) / 4`` with
@@ -121,6 +130,7 @@ class Step:
             products = [self.constant(x.row[0, 0] * y.row[0, 0]) for x, y in pairs]
             return Form(self, array_of(products, left.shape))
         entries = self._take("product", len(pairs))
+        pairs = [tuple(Scalar(_padded(s.row, self._next)) for s in pair) for pair in pairs]
         both = []
         for (x, y), (scale, _, _) in zip(pairs, entries, strict=True):
             if not scale > 0:
@@ -128,33 +138,47 @@ class Step:
             scaled, other = x.times(ball(scale)), y.times(1 / ball(scale))
             both += [scaled + other, scaled + other.times(arb(-1))]
         radii = self.states.radii(self.joined(both))
-        new = []
+        new, wider = [], self._next + len(pairs)
         for i, ((x, y), entry) in enumerate(zip(pairs, entries, strict=True)):
             c, d = x.row[0, 0], y.row[0, 0]
-            row = x.row * d + y.row * c
+            row = _padded((x.times(d) + y.times(c)).row, wider)
             row[0, 0] = c * d
             self._put("product", row, 0, -(radii[2 * i + 1] ** 2) / 4, radii[2 * i] ** 2 / 4, entry)
             new.append(Scalar(row))
         return Form(self, array_of(new, left.shape))
 
-    def finish(self) -> None:
-        """Make sure that every recorded relaxation was used."""
+    def matrix(self, weight: torch.Tensor) -> arb_mat:
+        """A constant matrix, exact; the same one at every step."""
+        if id(weight) not in self._matrices:
+            exact = arb_mat(*weight.shape, balls(weight.detach().double().flatten().tolist()))
+            self._matrices[id(weight)] = weight, exact  # the tensor is kept, and with it its id
+        return self._matrices[id(weight)][1]
+
+    def finish(self, after: Form) -> arb_mat:
+        """The next state's rows over all variables, once every recorded relaxation was used."""
         left = next(self._record, None)
         if left is not None:
             raise Unproved(f"a relaxation of '{left[0]}' is recorded that the loop does not use")
+        return _padded(after.rows(), self._width)
 
     def joined(self, scalars: Sequence[Scalar]) -> arb_mat:
         """Rows as one matrix."""
         if len(scalars) == 1:
             return scalars[0].row
-        return arb_mat(len(scalars), self.width, [a for s in scalars for a in s.row.entries()])
+        width = max(s.row.ncols() for s in scalars)
+        flat: list[arb] = []
+        for s in scalars:
+            flat += s.row.entries()
+            flat += [_ZERO] * (width - s.row.ncols())
+        return arb_mat(len(scalars), width, flat)
 
     def split(self, rows: arb_mat, shape: tuple[int, ...]) -> Form:
         """A matrix's rows as a form."""
-        return Form(self, array_of(self._scalars(rows), shape), rows)
+        return Form(self, rows=rows, shape=shape)
 
-    def _scalars(self, rows: arb_mat) -> list[Scalar]:
-        flat, width = rows.entries(), self.width
+    def scalars(self, rows: arb_mat) -> list[Scalar]:
+        """A matrix's rows one by one."""
+        flat, width = rows.entries(), rows.ncols()
         return [Scalar(arb_mat(1, width, flat[i : i + width])) for i in range(0, len(flat), width)]
 
     def _take(self, name: str, count: int) -> Sequence[Entry]:
@@ -179,19 +203,27 @@ class Step:
 class Form:
     """An array of :class:`Scalar` that answers torch's operations; no batch dimensions."""
 
-    def __init__(self, step: Step, values: np.ndarray, rows: arb_mat | None = None) -> None:
-        self.step = step
-        self.values = values
-        self._rows = rows
+    def __init__(
+        self,
+        step: Step,
+        values: np.ndarray | None = None,
+        *,
+        rows: arb_mat | None = None,
+        shape: tuple[int, ...] | None = None,
+    ) -> None:
+        self.step, self._values, self._rows = step, values, rows  # either may be made of the other
+        self.shape: tuple[int, ...] = values.shape if shape is None else shape
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape."""
-        return self.values.shape
+    def values(self) -> np.ndarray:
+        """All entries one by one."""
+        if self._values is None:
+            self._values = array_of(self.step.scalars(self._rows), self.shape)
+        return self._values
 
     def dim(self) -> int:
         """Number of dimensions."""
-        return self.values.ndim
+        return len(self.shape)
 
     def rows(self) -> arb_mat:
         """All entries as one matrix."""
@@ -276,6 +308,18 @@ def _handler(name: str) -> Callable[..., Any]:
     return handler
 
 
+def _padded(rows: arb_mat, width: int) -> arb_mat:
+    """Rows with zeros up to that width."""
+    old = rows.ncols()
+    if old == width:
+        return rows
+    flat, wider = rows.entries(), []
+    for i in range(rows.nrows()):
+        wider += flat[i * old : (i + 1) * old]
+        wider += [_ZERO] * (width - old)
+    return arb_mat(rows.nrows(), width, wider)
+
+
 def array_of(scalars: Sequence[Scalar], shape: tuple[int, ...] | None = None) -> np.ndarray:
     """Scalars as an array."""
     out = np.empty(len(scalars), dtype=object)
@@ -311,8 +355,7 @@ def _joined(join: Callable[..., np.ndarray]) -> Callable[..., Form]:
 def _linear(x: Form, weight: torch.Tensor, bias: torch.Tensor | None = None) -> Form:
     if x.dim() != 1:
         raise UnsupportedOperationError("the checker knows linear layers on vectors only")
-    matrix = arb_mat(*weight.shape, [ball(v) for v in weight.detach().double().flatten().tolist()])
-    rows = matrix * x.rows()
+    rows = x.step.matrix(weight) * x.rows()
     for i, value in enumerate([] if bias is None else bias.detach().double().tolist()):
         rows[i, 0] = rows[i, 0] + ball(value)
     return x.step.split(rows, (weight.shape[0],))

@@ -47,7 +47,7 @@ def test_linear_operations_are_exact(name):
     found = bounds(step, f(x))
     np.testing.assert_allclose([b[0] for b in found], values.min(0), atol=1e-12)
     np.testing.assert_allclose([b[1] for b in found], values.max(0), atol=1e-12)
-    step.finish()
+    step.finish(f(x))
 
 
 NONLINEAR = {
@@ -71,7 +71,7 @@ def test_whatever_is_recorded_every_value_is_enclosed(name, slope):
     record = [(operation, [(slope, 0.1, 1e3)] * width) for operation, width in operations]
     step, x = make(record)
     form = f(x)
-    step.finish()
+    assert step.finish(form).ncols() == 4 + sum(width for _, width in operations)
     grid = torch.cartesian_prod(torch.linspace(1, 1.5, 21), torch.linspace(-0.5, 0.5, 21)).double()
     values = np.stack([f(p).numpy().reshape(-1) for p in grid])
     for (low, high), column in zip(bounds(step, form), values.T, strict=True):
@@ -96,7 +96,7 @@ def test_the_record_must_be_of_what_the_loop_does():
         torch.sin(x)
     step, x = make([("sin", [(0.0, 0.0, 9.0)])])
     with pytest.raises(Unproved, match="a relaxation of 'sin' is recorded that the loop does not use"):
-        step.finish()
+        step.finish(x)
 
 
 @pytest.mark.parametrize("operation", [torch.erf, torch.floor, lambda x: torch.where(x, 1.0, 2.0), lambda x: x.round()])
