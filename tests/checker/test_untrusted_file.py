@@ -68,7 +68,7 @@ ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" f
         (lambda t: t.replace("horizon: 8", "horizon: 010"), "could be misread"),
         (lambda t: ALIASES + t.replace("name: disc", "name: *a39"), "holds an alias"),
         (lambda t: "q: &q {dt: 0.2}\n" + t.replace("  dt: 0.1\n", "  <<: *q\n"), "holds an alias"),
-        (lambda t: t + "z: " + "[" * 1500, "recursion"),
+        (lambda t: t + "z: " + "[" * 1500, "levels deep"),
         (lambda t: t + "z: " + "[" * 200_000, "characters, more than"),
     ],
 )
