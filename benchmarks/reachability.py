@@ -163,7 +163,7 @@ def unicycle_tightness(quick: bool) -> list[Figure]:
 def _four_cells(name: str, asked_seconds: float, asked_width: float, quick: bool) -> list[Figure]:
     case = cases.load(name, FOLDER)
     cells = cells_of(case, 4)
-    seconds, tube = timed(lambda: Affine().propagate(case.loop(), cells, case.disturbance))
+    seconds, tube = timed(lambda: Affine().propagate(case.loop(), cells, case.disturbance), 5)
     width = against_inner(tube.hull(), case.loop(), case.start, case.disturbance, every=20 if quick else 10)
     return [
         Figure("affine, 4 cells: time", seconds, "s", asked_seconds),
@@ -223,7 +223,7 @@ def learned(quick: bool) -> list[Figure]:
 @row("throughput, planar quadrotor")
 def throughput(quick: bool) -> list[Figure]:
     case = cases.load("planar_quadrotor", FOLDER)
-    count, symbols, at_once = 32 if quick else 256, 60, 128
+    count, symbols, at_once = 32 if quick else 256, 60, 256
     shifts = torch.linspace(-0.2, 0.2, count, dtype=torch.float64)
     references = case.references[torch.arange(count) % len(case.references)].clone()
     references[..., 1] += shifts[:, None]  # the robot is the same anywhere: shifted trajectories are as feasible
@@ -241,7 +241,7 @@ def throughput(quick: bool) -> list[Figure]:
             parts.append(Affine(symbols=kept).propagate(loop, box, case.disturbance))
         return Tube(torch.cat([p.lower for p in parts]), torch.cat([p.upper for p in parts]))
 
-    seconds, tube = timed(lambda: run(symbols, len(owner)), 1)
+    seconds, tube = timed(lambda: run(symbols, len(owner)))
     full = run(None, 16)
     return [
         Figure(

@@ -57,15 +57,15 @@ def reduce_arrays(generators: np.ndarray, limit: int | None = None) -> tuple[np.
     if mask is None:
         return generators, None
     if mask.ndim == 1:
-        kept, dropped = generators[..., mask], size[..., ~mask]
-    else:
-        every = np.broadcast_to(mask[:, None], generators.shape)
-        kept, dropped = generators[every].reshape(cells, n, -1), size[~every].reshape(cells, n, -1)
+        kept, dropped = generators[..., mask], size @ (~mask).astype(float)
+    else:  # as many in every cell
+        index = np.nonzero(mask)[1].reshape(cells, 1, -1)
+        kept = np.take_along_axis(generators, np.broadcast_to(index, (cells, n, index.shape[-1])), axis=-1)
+        dropped = (size @ (~mask).astype(float)[..., None])[..., 0]
     count = kept.shape[-1]
     reduced = np.zeros((cells, n, count + n))
     reduced[..., :count] = kept
-    radius = np.add.reduce(dropped, axis=-1) * _rounded_up(dropped.shape[-1])
-    reduced.reshape(cells, -1)[:, count :: count + n + 1] = radius
+    reduced.reshape(cells, -1)[:, count :: count + n + 1] = dropped * _rounded_up(size.shape[-1])
     return reduced, mask
 
 
