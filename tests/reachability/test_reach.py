@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+import pathlib
 import random
 import subprocess
 import sys
@@ -640,6 +641,50 @@ def test_what_cannot_be_bounded_is_refused_in_one_line_that_names_it(name):
     with pytest.raises(kind, match=words) as caught:
         reach(step, START, DISTURBANCE, K)
     assert isinstance(caught.value, SagempError) and "\n" not in str(caught.value)
+
+
+READERS = {
+    "torch.tensor": lambda x, w: torch.tensor(x) * 0.5,
+    "torch.tensor of entries": lambda x, w: torch.tensor([x[0], x[1], x[2]]) * 0.5,
+    "torch.Tensor": lambda x, w: torch.Tensor(x) * 0.5,
+    "torch.DoubleTensor": lambda x, w: torch.DoubleTensor(x) * 0.5,
+    "as_tensor of entries": lambda x, w: torch.as_tensor([x[0], x[1], x[2]]) * 0.5,
+    "jacrev": lambda x, w: torch.func.jacrev(torch.sin)(x) @ x,
+    "jacfwd": lambda x, w: torch.func.jacfwd(torch.sin)(x) @ x,
+    "vmap": lambda x, w: torch.vmap(torch.sin)(x),
+    "nested_tensor": lambda x, w: torch.nested.nested_tensor([x, x])[0] * 0.5,
+    "set_": lambda x, w: torch.zeros(3, dtype=torch.float64).set_(x) * 0.5,
+    "as_subclass": lambda x, w: x.as_subclass(torch.Tensor) * 0.5,
+    "_make_subclass": lambda x, w: torch.Tensor._make_subclass(torch.Tensor, x) * 0.5,
+    "dlpack": lambda x, w: torch.from_dlpack(torch.utils.dlpack.to_dlpack(x)) * 0.5,
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", READERS)
+def test_what_would_read_the_memory_of_a_value_is_refused(name):
+    with pytest.raises(UnsupportedOperationError if name != "dlpack" else NonFiniteError) as caught:
+        reach(READERS[name], START, DISTURBANCE, 2, batched=False)
+    assert "\n" not in str(caught.value) and "test_reach.py, line" in str(caught.value) or name == "dlpack"
+
+
+def test_no_function_of_torch_that_is_given_a_value_kills_the_interpreter():
+    names = (
+        "tensor as_tensor asarray Tensor DoubleTensor FloatTensor from_dlpack frombuffer from_numpy sparse_coo_tensor "
+        "scalar_tensor vmap nested set_ is_tensor numel stack where index_put bincount svd"
+    )
+    script = str(pathlib.Path(__file__).with_name("fuzzed_functions.py"))
+    done = subprocess.run(
+        [sys.executable, script, "torch", *names.split()], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{done.stdout.split()[-1:]}: {done.stderr[:500]}"
+    assert {"tensor", "asarray", "DoubleTensor"} <= set(done.stdout.split())
+
+
+def test_a_tensor_that_is_asked_for_as_a_tensor_is_the_value_itself():
+    for same in (torch.as_tensor, torch.asarray, torch.nn.Parameter):
+        tube = reach(lambda x, w, same=same: 0.5 * same(x) + 0.0 * w[0], START, DISTURBANCE, 1)
+        assert torch.allclose(tube.width[1], 0.5 * START.width)
 
 
 def test_a_step_with_two_meanings_may_say_which_is_meant():

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.tracing.program import Program, Recorder
-from sagemp_cli.reachability.tracing.value import UFUNCS, Traced
+from sagemp_cli.reachability.tracing.value import UFUNCS, Traced, exact
 from sagemp_cli.sets import Box
 
 TOLERANCE = 1e-9
@@ -101,7 +101,7 @@ class Step:
                 raise UsageError("step returned a value of an earlier call; it must be a function of x and w only")
             ids = result.ids
         else:
-            ids = recorder.constant(result.detach().to(torch.float64))
+            ids = recorder.constant(exact(result, operation="return"))
         return recorder.finish(ids.reshape(-1))
 
     def _plain(self, result: Any, shape: torch.Size) -> Tensor:

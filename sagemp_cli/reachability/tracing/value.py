@@ -11,7 +11,7 @@ Constants are taken as the exact numbers they are: float32 weights are not round
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -62,20 +62,28 @@ def exact(value: Any, *, operation: str) -> Tensor:
     return double
 
 
-class Traced:
-    """A value of a recorded step; see the module."""
+class Traced(Tensor):
+    """A value of a recorded step; see the module.
 
-    __slots__ = ("ids", "recorder")
+    It is a tensor of torch's own kind, of the right shape and strides, so that code which takes its class at its word
+    finds what it expects. Whatever does not ask ``__torch_function__`` (constructors such as ``torch.tensor``,
+    transforms, compiled code) ends in ``__torch_dispatch__``, which refuses it; and what goes past that too reads NaN,
+    which no program may hold.
+    """
+
+    ids: Tensor
+    recorder: Recorder
+
+    @staticmethod
+    def __new__(cls, recorder: Recorder, ids: Tensor) -> Traced:
+        """A value whose entries have these ids."""
+        memory = torch.full((ids.untyped_storage().nbytes() // ids.element_size(),), torch.nan, dtype=torch.float64)
+        value = Tensor._make_subclass(cls, memory.as_strided(ids.size(), ids.stride(), ids.storage_offset()))
+        value.ids = ids
+        value.recorder = recorder
+        return value
+
     __hash__ = object.__hash__
-
-    def __init__(self, recorder: Recorder, ids: Tensor) -> None:
-        self.recorder = recorder
-        self.ids = ids
-
-    @property
-    def __class__(self) -> type:  # type: ignore[override]
-        """A tensor, to those who ask with isinstance: a step must not do something else because it is recorded."""
-        return Tensor
 
     # -- what a tensor says of itself ---------------------------------------------------------------------------------
 
@@ -191,6 +199,19 @@ class Traced:
     ) -> Any:
         return _dispatch(function, args, kwargs or {})
 
+    @classmethod
+    def __torch_dispatch__(
+        cls, function: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        """Refused: what comes here has gone past ``__torch_function__``."""
+        error = UnsupportedOperationError(
+            "torch.tensor(...), torch.Tensor(...), torch.asarray(...), torch.func, compiled and scripted code ask for "
+            f"the memory of a value ('{_plain_name(function)}'), a set has none; use torch's functions on the value "
+            "itself, and torch.stack to put values together"
+        )
+        _note(error, (*args, *(kwargs or {}).values()))
+        raise error
+
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         function = UFUNCS.get(ufunc.__name__)
         if function is None or method != "__call__" or options:
@@ -264,11 +285,22 @@ def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
         return _answered(function, args, kwargs)
     except SagempError as error:
         # A step that catches the error must not go on with something else than what it does on tensors.
-        for value in (*args, *kwargs.values()):
-            for each in value if type(value) in (list, tuple) else (value,):
-                if isinstance(each, Traced):
-                    each.recorder.refusal = each.recorder.refusal or error
+        _note(error, (*args, *kwargs.values()))
         raise
+
+
+def _note(error: SagempError, values: Iterable[Any]) -> None:
+    """Remember a refusal with the recorder of the values that it is about."""
+    for value in values:
+        if isinstance(value, Traced):
+            value.recorder.refusal = value.recorder.refusal or error
+        elif type(value) in (list, tuple, dict):
+            _note(error, value.values() if isinstance(value, dict) else value)
+
+
+def _plain_name(function: Any) -> str:
+    """``aten.add.Tensor`` is ``add``."""
+    return str(getattr(getattr(function, "overloadpacket", function), "__name__", function))
 
 
 def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
