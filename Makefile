@@ -44,7 +44,7 @@ lint: venv  ## check style and format
 
 # An unknown or falsified verdict (exit codes 5 and 10) has a figure too.
 reproduce-figures: venv  ## make every artifact and figure at full effort
-	@for experiment in $$($(BIN)/python -c 'from sagemp_cli.config import options_of; print(*options_of("experiment"))'); do \
+	@for experiment in $$($(BIN)/python -c 'from sagemp_cli.config.composition import options_of; print(*options_of("experiment"))'); do \
 		$(BIN)/sagemp run experiment=$$experiment; code=$$?; \
 		case $$code in 0|5|10) ;; *) exit $$code;; esac; \
 	done

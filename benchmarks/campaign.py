@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from inner import SIMULATION_MARGIN, attack_tube
 
-from sagemp_cli.closed_loop import ClosedLoop
-from sagemp_cli.reachability.inner import SIMULATION_MARGIN, attack_tube
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.storage import Certificate, Library, open_header, read_artifact
 from sagemp_cli.trackers import Tracker
 

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.binding import build
-from sagemp_cli.closed_loop import ClosedLoop
-from sagemp_cli.config import compose
+from sagemp_cli.config.binding import build
+from sagemp_cli.config.composition import compose
 from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.experts import Expert, Weights, plan_demonstrations, solve_problem
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.progress import Progress, Silent, Task
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.identification import EnclosureWeight, ModelErrors, learn_dynamics
-from sagemp_cli.stages.problem import robot_of
+from sagemp_cli.pipeline.problem import robot_of
 
 
 def learned_unicycle(*, seed: int = 0, updates: int = 1500) -> tuple[Learned, ModelErrors]:

@@ -1,4 +1,4 @@
-"""Affine arithmetic in plain float64, for the price of rigour: :mod:`sagemp_cli.reachability.planned_run` on the same
+"""Affine arithmetic in plain float64, for the price of rigour: :mod:`.affine.compiled.run` on the same
 plan, with the same sums over generators and the same reduction, but without its account of rounding.
 
 Its tubes prove nothing.
@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.foldable_loop import FoldableLoop
-from sagemp_cli.reachability.folding import Combination, Node, Plan, plan_of
-from sagemp_cli.reachability.planned_operations import States, diagonal
-from sagemp_cli.reachability.reduction import reduce_arrays
-from sagemp_cli.reachability.relaxations.band import TINY
+from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop
+from sagemp_cli.reachability.affine.compiled.folding import Combination, Node, Plan, plan_of
+from sagemp_cli.reachability.affine.compiled.operations import States, diagonal
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.order_reduction import reduce_arrays
+from sagemp_cli.sets.rounding import TINY
 
 Array = np.ndarray
 Form = tuple[Array, Array]

@@ -30,17 +30,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cases  # noqa: E402
 import plain_affine  # noqa: E402
+from inner import inner_estimate  # noqa: E402
 from learned import learned_unicycle  # noqa: E402
 from swarm import Swarm  # noqa: E402
 
-from sagemp_cli.closed_loop import ClosedLoop, FoldedLoop  # noqa: E402
-from sagemp_cli.reachability.affine import Affine  # noqa: E402
-from sagemp_cli.reachability.auto_lirpa import AutoLirpa  # noqa: E402
-from sagemp_cli.reachability.best import Best  # noqa: E402
-from sagemp_cli.reachability.inner import inner_estimate  # noqa: E402
-from sagemp_cli.reachability.partition import parse_partitions, partition, uncertain_dimensions  # noqa: E402
+from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop  # noqa: E402
+from sagemp_cli.reachability.affine.affine import Affine  # noqa: E402
+from sagemp_cli.reachability.crown.best import Best  # noqa: E402
+from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa  # noqa: E402
 from sagemp_cli.reachability.propagator import Loop, Propagator  # noqa: E402
 from sagemp_cli.sets import Box, Tube  # noqa: E402
+from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions  # noqa: E402
 
 FOLDER = Path("artifacts") / "benchmarks"
 MEMORY = 2.0

@@ -11,8 +11,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.dynamics import Dynamics
+from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.trackers import Tracker
 
 VELOCITY = slice(6, 9)

@@ -18,9 +18,9 @@ torch.set_num_threads(1)
 @pytest.fixture(scope="session")
 def toy_root(tmp_path_factory) -> Path:
     """The folder that the toy experiment's artifacts were written below; treat it as read-only."""
-    from sagemp_cli.config import compose
-    from sagemp_cli.stages.context import StageContext
-    from sagemp_cli.stages.stage import STAGES
+    from sagemp_cli.config.composition import compose
+    from sagemp_cli.pipeline.context import StageContext
+    from sagemp_cli.pipeline.stage import STAGES
 
     root = tmp_path_factory.mktemp("artifacts")
     config = compose(["effort=toy", f"artifacts={root}"])
@@ -100,7 +100,7 @@ def learned_unicycle_of(section: Any = LEARNED_UNICYCLE, *, scale: float = 0.1, 
     """
     import torch
 
-    from sagemp_cli.binding import build
+    from sagemp_cli.config.binding import build
 
     robot = build(section, "dynamics")
     first, second, last = robot.layers

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.binding import build, target_class
 from sagemp_cli.checker.balls import BITS, Unproved, arb, ball, ctx, number
 from sagemp_cli.checker.cell import CellClaim, Policy, prove_cell
 from sagemp_cli.checker.counterexample import applies, prove_violation
 from sagemp_cli.checker.cover import covered
 from sagemp_cli.checker.document import Document, read_document
 from sagemp_cli.checker.scene import SafeSet, require_known
+from sagemp_cli.config.binding import build, target_class
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ArtifactError, SagempError
 from sagemp_cli.progress import Progress, Silent

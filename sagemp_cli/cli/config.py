@@ -19,7 +19,7 @@ def show(overrides: Overrides = None) -> None:
     """Print the resolved config, as it is stored in every artifact."""
     import yaml
 
-    from sagemp_cli.config import compose
+    from sagemp_cli.config.composition import compose
 
     typer.echo(yaml.safe_dump(compose(overrides or []), sort_keys=False, default_flow_style=None), nl=False)
 
@@ -30,8 +30,8 @@ def validate(overrides: Overrides = None) -> None:
 
     With overrides, the config that they give is checked instead.
     """
-    from sagemp_cli.config import compose, groups, options_of
-    from sagemp_cli.stages.requirements import require_sound_config
+    from sagemp_cli.config.composition import compose, groups, options_of
+    from sagemp_cli.pipeline.requirements import require_sound_config
 
     choices = [list(overrides)] if overrides else [[f"{g}={o}"] for g in groups() for o in options_of(g)]
     wrong = []
@@ -51,7 +51,7 @@ def validate(overrides: Overrides = None) -> None:
 @app.command("list", cls=Command, epilog=examples("sagemp config list", "sagemp config list experiment=unicycle_node"))
 def list_options(overrides: Overrides = None) -> None:
     """List the config groups and their options; the ones in use are marked with a star."""
-    from sagemp_cli.config import chosen_options, groups, options_of, resource_folder
+    from sagemp_cli.config.composition import chosen_options, groups, options_of, resource_folder
 
     chosen = chosen_options(overrides or [])
     for group in groups():

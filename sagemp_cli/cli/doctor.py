@@ -38,7 +38,7 @@ def examine() -> dict[str, Any]:
     import torch
 
     from sagemp_cli import __version__
-    from sagemp_cli.config import options_of, resource_folder
+    from sagemp_cli.config.composition import options_of, resource_folder
 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -67,10 +67,10 @@ def _version(package: str) -> str | None:
 
 def _test(option: str) -> dict[str, Any]:
     """One propagator of the config: sound, unsound, or why it does not work here."""
-    from sagemp_cli.binding import build
-    from sagemp_cli.config import compose
+    from sagemp_cli.config.binding import build
+    from sagemp_cli.config.composition import compose
     from sagemp_cli.errors import SagempError
-    from sagemp_cli.reachability.selftest import sound_on_a_small_loop
+    from sagemp_cli.verification.selftest import sound_on_a_small_loop
 
     began = time.perf_counter()
     try:

@@ -16,8 +16,8 @@ from sagemp_cli.cli.time_limit import time_limit as limited
 from sagemp_cli.errors import ArtifactError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from sagemp_cli.stages.context import StageContext
-    from sagemp_cli.stages.stage import Stage
+    from sagemp_cli.pipeline.context import StageContext
+    from sagemp_cli.pipeline.stage import Stage
 
 EXAMPLES = examples(
     "sagemp run",
@@ -44,7 +44,7 @@ def run(
     falsified, 5 unknown.
     """
     from sagemp_cli.cli import verdict
-    from sagemp_cli.stages.stage import STAGES, stages_of
+    from sagemp_cli.pipeline.stage import STAGES, stages_of
 
     names = [stage.name for stage in STAGES]
     if until is not None and until not in names:
@@ -67,8 +67,8 @@ def run(
 
 def _make(context: StageContext, stages: Sequence[Stage], *, dry_run: bool, prefix: str = "") -> None:
     """Make what is missing or stale of these stages' files, first in the experiments that some are taken from."""
-    from sagemp_cli.stages.freshness import Freshness, survey
-    from sagemp_cli.stages.stage import stages_of
+    from sagemp_cli.pipeline.freshness import Freshness, survey
+    from sagemp_cli.pipeline.stage import stages_of
 
     for stage in stages:
         owner = context.owner(stage.name)

@@ -66,7 +66,7 @@ def safety_rates(
 
 def _root(given: Sequence[str]) -> Path:
     """The folder of all experiments: ``artifacts``, unless an override names another."""
-    from sagemp_cli.config import compose
+    from sagemp_cli.config.composition import compose
 
     others = [override for override in given if not override.startswith("artifacts=")]
     if others:

@@ -12,8 +12,8 @@ from sagemp_cli.cli.time_limit import time_limit
 from sagemp_cli.errors import ArtifactError
 
 if TYPE_CHECKING:
-    from sagemp_cli.stages.context import StageContext
-    from sagemp_cli.stages.freshness import FileState
+    from sagemp_cli.pipeline.context import StageContext
+    from sagemp_cli.pipeline.freshness import FileState
 
 
 def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext:
@@ -21,9 +21,9 @@ def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext
     import torch
 
     from sagemp_cli.cli.console import console_progress
-    from sagemp_cli.config import compose
-    from sagemp_cli.stages.context import StageContext
-    from sagemp_cli.stages.requirements import require_sound_config
+    from sagemp_cli.config.composition import compose
+    from sagemp_cli.pipeline.context import StageContext
+    from sagemp_cli.pipeline.requirements import require_sound_config
 
     torch.set_num_threads(1)  # several processes with several threads each slow each other down many times over
     config = compose(overrides)
@@ -51,7 +51,7 @@ def output_of(
         seconds: time limit.
         shown: what the command prints of an output that is up to date; without it such an output is in the way.
     """
-    from sagemp_cli.stages.freshness import Freshness, survey
+    from sagemp_cli.pipeline.freshness import Freshness, survey
 
     context = context_of(overrides, overwrite=overwrite)
     states = survey(context, last=name)
@@ -72,7 +72,7 @@ def output_of(
 
 def _refuse_existing(state: FileState, overwrite: bool) -> None:
     """Raise if the output is there already: nothing that exists is replaced unasked."""
-    from sagemp_cli.stages.freshness import Freshness
+    from sagemp_cli.pipeline.freshness import Freshness
 
     if overwrite or state.freshness is Freshness.MISSING:
         return
@@ -86,7 +86,7 @@ def _refuse_existing(state: FileState, overwrite: bool) -> None:
 
 def _require_inputs(context: StageContext, states: dict[str, FileState], name: str, overrides: list[str]) -> None:
     """Raise if an input is not there, and say which command makes it."""
-    from sagemp_cli.stages.freshness import Freshness
+    from sagemp_cli.pipeline.freshness import Freshness
 
     read = states[name].stage.inputs_in(context.config)
     missing = [s for s in read if states[s].freshness is Freshness.MISSING]

@@ -25,7 +25,7 @@ def status(
 
     A file is stale if a config key that it depends on, or one of its inputs, has changed since it was made.
     """
-    from sagemp_cli.stages.freshness import Freshness, survey
+    from sagemp_cli.pipeline.freshness import Freshness, survey
 
     given = overrides_of(overrides, seed=seed, partitions=partitions)
     context = context_of(given)

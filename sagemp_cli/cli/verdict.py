@@ -89,7 +89,7 @@ def _learned_lines(learned: dict[str, Any]) -> list[str]:
 
 def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
     """The same as plain data."""
-    from sagemp_cli.models import stand_in
+    from sagemp_cli.pipeline.models import stand_in
 
     record, tubes = certificate.record, certificate.record.tubes
     figure = certificate.path.with_suffix(".png")
@@ -136,7 +136,7 @@ def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
 
     Nothing in the loop enforces limits: the paper penalises them in training; the proof is about the model as it is.
     """
-    from sagemp_cli.binding import build
+    from sagemp_cli.config.binding import build
 
     tubes = certificate.record.tubes
     safe = [i for i, verdict in enumerate(tubes.verdict) if verdict == "SAFE"]
@@ -165,7 +165,7 @@ def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
 
 def _learned(certificate: Artifact[Certificate]) -> dict[str, Any] | None:
     """Of a learned robot what is proved of its analytical model; None for a robot of formulas."""
-    from sagemp_cli.binding import build
+    from sagemp_cli.config.binding import build
 
     if certificate.record.dynamics is None:
         return None

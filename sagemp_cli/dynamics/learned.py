@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.binding import build, target_class
+from sagemp_cli.config.binding import build, target_class
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError, did_you_mean
 

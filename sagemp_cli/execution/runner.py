@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import random_disturbances, worst_case_disturbances
 from sagemp_cli.library.closest import closest_reference
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.reachability.verification import Verification
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.verification.verification import Verification
 
 ROUNDING = 1e-9
 """Margin of the membership test, in state units: the tube encloses the real-arithmetic loop, and a simulated rollout

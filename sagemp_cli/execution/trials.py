@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.inverse import Inverse, invert
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import Loop, random_disturbances, worst_case_disturbances
 from sagemp_cli.execution.open_loop import OpenLoop
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.reachability.refutation import SoundnessError
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.verification.attack.refutation import SoundnessError
 
 DISTURBANCES = ("none", "random", "worst case")
 """Under which references are tried: the middle of W, uniform in W, and corners of W that are chosen to do harm."""

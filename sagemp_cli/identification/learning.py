@@ -14,9 +14,9 @@ from sagemp_cli.dynamics.learned import Learned, perceptron
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification.enclosure_loss import enclosure_error
 from sagemp_cli.identification.transitions import Transitions, domain_of
+from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.progress import Progress
 from sagemp_cli.sets import Box
-from sagemp_cli.training import History, fit
 
 BINS = 60
 """Of the error histograms."""
@@ -87,9 +87,9 @@ def learn_dynamics(
         transitions: how many are drawn to learn from; the paper has 2e6 for the unicycle.
         held_out: how many more are drawn, between the robot's limits, to measure the error.
         margin: share of each range that learning goes beyond the limits: errors are largest at the edge of the data.
-        steps, batch, learning_rate, ema_decay: see :func:`sagemp_cli.training.fit`.
+        steps, batch, learning_rate, ema_decay: see :func:`sagemp_cli.learning.fit.fit`.
         enclosure: the second part of the loss; None for none.
-        checkpoint, identity, progress: see :func:`~sagemp_cli.training.fit`.
+        checkpoint, identity, progress: see :func:`~sagemp_cli.learning.fit.fit`.
 
     Returns:
         The course of training, with the validation's root mean square error per state in units of the state per second,

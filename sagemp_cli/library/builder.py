@@ -11,9 +11,9 @@ from torch import Tensor
 
 from sagemp_cli.errors import EXIT_UNKNOWN, ConfigError, SagempError
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.reachability.verdict import Outcome
-from sagemp_cli.reachability.verification import Verification
 from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.verification.verdict import Outcome
+from sagemp_cli.verification.verification import Verification
 
 REFERENCE_COLLIDES = "reference in collision"
 REFERENCE_MISSES = "reference misses goal"

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.learning.fit import History, Loss
 from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.training import History, Loss
 
 
 @runtime_checkable
@@ -101,7 +101,7 @@ class SelfTaughtPlanner(StoredPlanner, Protocol):
     ) -> History:
         """Train in place; ``options`` are the config's ``planner_training``, bound to the class's own signature.
 
-        ``checkpoint``, ``identity`` and ``progress`` are as in :func:`sagemp_cli.training.fit`.
+        ``checkpoint``, ``identity`` and ``progress`` are as in :func:`sagemp_cli.learning.fit.fit`.
         """
 
 

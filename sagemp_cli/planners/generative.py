@@ -199,7 +199,7 @@ class GenerativeLoss(ABC):
     def __call__(
         self, module: GenerativePlanner, step: int, generator: torch.Generator
     ) -> tuple[Tensor, Mapping[str, float]]:
-        """The loss of one update, see :data:`sagemp_cli.training.Loss`."""
+        """The loss of one update, see :data:`sagemp_cli.learning.fit.Loss`."""
         which = torch.randint(len(self._knots), (self._batch,), generator=generator)
         ends = self._ends[which]
         shift = 2 * torch.rand(ends.shape, generator=generator, dtype=torch.float64) - 1

@@ -72,7 +72,7 @@ class NeuralODELoss:
         self._spread, self._pull, self._hold = spread, pull, hold
 
     def __call__(self, module: NeuralODE, step: int, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
-        """The loss of update ``step`` and its parts, see :data:`sagemp_cli.training.Loss`."""
+        """The loss of update ``step`` and its parts, see :data:`sagemp_cli.learning.fit.Loss`."""
         derivative = self._derivative(module, generator)
         figures = {"derivative loss": float(derivative.detach())}
         if step < self._derivative_steps:

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.planners.base import LearnedPlanner
 from sagemp_cli.planners.figures import plan_figures
 from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.scene import Scene
-from sagemp_cli.training import History, fit
 
 PLANS = 200
 """Plans of a validation at least: as many from each held-out start as that takes."""
@@ -54,7 +54,7 @@ def train_planner(
         position: indices of the states that are the position.
         generator: source of all randomness.
         steps: number of updates.
-        learning_rate: see :func:`sagemp_cli.training.fit`.
+        learning_rate: see :func:`sagemp_cli.learning.fit.fit`.
         ema_decay: see there.
         loss: options of the planner's ``loss_type``.
         checkpoint: see there.

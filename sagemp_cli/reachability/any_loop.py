@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
-from sagemp_cli.reachability.foldable_loop import NotFoldable
-from sagemp_cli.reachability.partition import parse_partitions, partition, uncertain_dimensions
+from sagemp_cli.reachability.affine.compiled.foldable_loop import NotFoldable
+from sagemp_cli.reachability.program.probing import Step, agree, probe, reproduced
+from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.propagator import Loop, Propagator
-from sagemp_cli.reachability.tracing.probing import Step, agree, probe, reproduced
-from sagemp_cli.reachability.tracing.program import Program
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions
 
 PROPAGATORS = {
-    "affine": ("affine", "Affine"),
-    "auto_lirpa": ("auto_lirpa", "AutoLirpa"),
-    "best": ("best", "Best"),
-    "crown": ("crown", "Crown"),
-    "interval": ("interval", "Interval"),
+    "affine": ("affine.affine", "Affine"),
+    "auto_lirpa": ("lirpa.auto_lirpa", "AutoLirpa"),
+    "best": ("crown.best", "Best"),
+    "crown": ("crown.crown", "Crown"),
+    "interval": ("interval.interval", "Interval"),
 }
 """Name to module of this package and class."""
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.errors import UsageError
+from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
 
@@ -15,7 +15,7 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
     """The start box, broadcast against the batch of the loop's references.
 
     Args:
-        loop: a :class:`~sagemp_cli.closed_loop.ClosedLoop`, folded or not, may have a batch; any other loop has none
+        loop: a :class:`~.closed_loop.ClosedLoop`, folded or not, may have a batch; any other loop has none
             of its own.
         start: ``(..., n)``.
         disturbance: ``(d,)``.

@@ -2,7 +2,7 @@
 
 A propagator evaluates ``loop.step`` once on such values. A type brings its own linear operations (``handlers``) and
 one method, :meth:`Form.relaxed`, for what is not linear; the nonlinear functions themselves are written once for all
-types, in :mod:`sagemp_cli.reachability.relaxed_operations`.
+types, in :mod:`sagemp_cli.reachability.relaxations.registry`.
 """
 
 from __future__ import annotations
@@ -160,5 +160,5 @@ def unsupported(name: str) -> UnsupportedOperationError:
     """The error for a torch operation that nothing is known of."""
     return UnsupportedOperationError(
         f"torch operation '{name}' has no relaxation in the native propagators (affine, crown, interval); "
-        f"add one in sagemp_cli/reachability/relaxations and register it in relaxed_operations.py"
+        f"add one in sagemp_cli/reachability/relaxations and register it in its registry.py"
     )

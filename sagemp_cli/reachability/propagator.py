@@ -10,7 +10,7 @@ from sagemp_cli.sets import Box, Tube
 
 
 class Loop(Protocol):
-    """Anything that steps: our :class:`~sagemp_cli.closed_loop.ClosedLoop` or a stranger's loop."""
+    """Anything that steps: our :class:`~sagemp_cli.loop.closed_loop.ClosedLoop` or a stranger's loop."""
 
     @property
     def horizon(self) -> int:

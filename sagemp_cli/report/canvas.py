@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 
-from sagemp_cli.binding import build
+from sagemp_cli.config.binding import build
 from sagemp_cli.dynamics.base import Dynamics
-from sagemp_cli.models import stand_in
+from sagemp_cli.pipeline.models import stand_in
 from sagemp_cli.scenes import Ball, Scene, scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.storage import Header

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-from sagemp_cli.binding import build
+from sagemp_cli.config.binding import build
 from sagemp_cli.report.canvas import INK, MODES, MUTED, blank_figure, headline, legend, style_axes, unit_text
 from sagemp_cli.report.training import draw_losses
 from sagemp_cli.storage import Artifact, DynamicsModel

@@ -9,7 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sagemp_cli.models import planner_from
+from sagemp_cli.pipeline.models import planner_from
 from sagemp_cli.planners.base import affordable
 from sagemp_cli.report.canvas import (
     DANGER,

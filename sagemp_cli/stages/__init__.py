@@ -1,1 +1,1 @@
-"""The pipeline's stages; the table of them is :data:`sagemp_cli.stages.stage.STAGES`."""
+"""The verbs of the pipeline, one file a stage; the table of them is :data:`sagemp_cli.pipeline.stage.STAGES`."""

@@ -10,17 +10,17 @@ import numpy as np
 from torch import Tensor
 
 from sagemp_cli.library import REASONS, build_library
-from sagemp_cli.models import planner_from, tracker_from
-from sagemp_cli.reachability.refutation import attack
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import planner_from, tracker_from
+from sagemp_cli.pipeline.options import is_whole, key_complaints, number_complaints
+from sagemp_cli.pipeline.problem import trained_problem
+from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.reference_starts import reference_starts, spread_complaints
+from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.library import draw_library
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import is_whole, key_complaints, number_complaints
-from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_starts import reference_starts, spread_complaints
-from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Library
+from sagemp_cli.verification.attack.refutation import attack
 
 
 def run(context: StageContext) -> Path:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from sagemp_cli.execution import execute_queries
-from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import planner_from, tracker_from
+from sagemp_cli.pipeline.options import key_complaints, number_complaints
+from sagemp_cli.pipeline.problem import trained_problem
+from sagemp_cli.pipeline.tubes import verification_of
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.rollouts import draw_rollouts
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import key_complaints, number_complaints
-from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.tubes import verification_of
 from sagemp_cli.storage import Rollouts
 
 

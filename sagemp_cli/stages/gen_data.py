@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.binding import option_complaints
+from sagemp_cli.config.binding import option_complaints
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts import (
     Demonstration,
@@ -18,13 +18,13 @@ from sagemp_cli.experts import (
     plan_demonstrations,
     solve_problems,
 )
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.options import number_complaints, without
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.demonstrations import draw_demonstrations
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.scenes.sides import side_label
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import number_complaints, without
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.problem import problem_of
 from sagemp_cli.storage import Demonstrations
 
 _KEYS = ("count", "processes", "weights")

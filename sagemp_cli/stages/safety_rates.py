@@ -14,15 +14,15 @@ import numpy as np
 
 from sagemp_cli.execution import DISTURBANCES, require_certified_safe, try_references
 from sagemp_cli.execution import Trials as Found
-from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import planner_from, tracker_from
+from sagemp_cli.pipeline.options import key_complaints, number_complaints
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.problem import trained_problem
+from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.reference_starts import reference_starts, spread_complaints
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.safety import draw_safety
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import key_complaints, number_complaints
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_starts import reference_starts, spread_complaints
 from sagemp_cli.storage import SafetyRates, Trials
 
 

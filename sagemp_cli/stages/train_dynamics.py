@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.binding import option_complaints
+from sagemp_cli.config.binding import option_complaints
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification import EnclosureWeight, learn_dynamics
-from sagemp_cli.models import curve_of, figures_at_end, weights_of
+from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import curve_of, figures_at_end, weights_of
+from sagemp_cli.pipeline.options import without
+from sagemp_cli.pipeline.partial import PartialFile
+from sagemp_cli.pipeline.problem import robot_of
+from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.report.dynamics import draw_dynamics
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import without
-from sagemp_cli.stages.partial import PartialFile
-from sagemp_cli.stages.problem import robot_of
-from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import DynamicsModel
-from sagemp_cli.training import GIVEN_TO_TRAINING
 
 _GIVEN = ("robot", "enclosure", *GIVEN_TO_TRAINING)
 

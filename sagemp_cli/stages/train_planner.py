@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.binding import build, option_complaints, target_class
+from sagemp_cli.config.binding import build, option_complaints, target_class
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.models import curve_of, data_arguments, figures_at_end, weights_of
+from sagemp_cli.learning.fit import GIVEN_TO_TRAINING, History
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import curve_of, data_arguments, figures_at_end, weights_of
+from sagemp_cli.pipeline.options import without
+from sagemp_cli.pipeline.partial import PartialFile
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.planners import (
     LearnedPlanner,
     SelfTaughtPlanner,
@@ -26,12 +31,8 @@ from sagemp_cli.planners import (
 )
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.planner import draw_planner
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import without
-from sagemp_cli.stages.partial import PartialFile
-from sagemp_cli.stages.problem import Problem, problem_of
 from sagemp_cli.storage import Artifact, Parent, PlannerModel
-from sagemp_cli.training import GIVEN_TO_TRAINING, History
+from sagemp_cli.verification.problem import Problem
 
 TRAJECTORIES = "trajectories"
 """Role of a file of trajectories among the planner's parents."""

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.binding import build, option_complaints
-from sagemp_cli.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
+from sagemp_cli.config.binding import build, option_complaints
+from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
+from sagemp_cli.pipeline.options import number_complaints, without
+from sagemp_cli.pipeline.partial import PartialFile
+from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.training import draw_training
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import number_complaints, without
-from sagemp_cli.stages.partial import PartialFile
-from sagemp_cli.stages.problem import trained_problem
 from sagemp_cli.storage import TrackerModel
 from sagemp_cli.trackers.losses import LossWeights
-from sagemp_cli.trackers.policy import Tracker
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
-from sagemp_cli.training import GIVEN_TO_TRAINING
 
 
 def run(context: StageContext) -> Path:

@@ -6,23 +6,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sagemp_cli.binding import option_complaints
-from sagemp_cli.models import planner_from, tracker_from
+from sagemp_cli.config.binding import option_complaints
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import planner_from, tracker_from
+from sagemp_cli.pipeline.options import key_complaints, number_complaints
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.problem import trained_problem
+from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.reference_file import read_references
+from sagemp_cli.pipeline.true_model import TrueModelProof
+from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.planners.trajectory_file import REFERENCES
-from sagemp_cli.reachability.falsifier import Counterexample as Found
-from sagemp_cli.reachability.refutation import attack
-from sagemp_cli.reachability.verdict import answer_of
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.options import key_complaints, number_complaints
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.problem import trained_problem
-from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.reference_file import read_references
-from sagemp_cli.stages.true_model import TrueModelProof
-from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Artifact, Certificate, Counterexample, Parent
+from sagemp_cli.verification.attack.falsifier import Counterexample as Found
+from sagemp_cli.verification.attack.refutation import attack
+from sagemp_cli.verification.verdict import answer_of
 
 _KEYS = ("partitions", "budget", "memory", "references", "file", "falsifier", "true_model")
 
@@ -78,7 +78,7 @@ def run(context: StageContext) -> Path:
 
 
 def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``verify``, except its partition (see :mod:`sagemp_cli.stages.proof`)."""
+    """What is wrong with the section ``verify``, except its partition (see :mod:`sagemp_cli.pipeline.proof`)."""
     section, search = config["verify"], config["verify"].get("falsifier")
     given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
     wrong = option_complaints(attack, search, "verify.falsifier", given=given)

@@ -1,5 +1,5 @@
 """The tracking policy, the paper's losses, and training."""
 
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.loop.tracker import Tracker
 
 __all__ = ["Tracker"]

@@ -14,15 +14,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.learning.fit import History, fit
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.progress import Progress
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers.losses import LossWeights, rollout_loss
-from sagemp_cli.trackers.policy import Tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
-from sagemp_cli.training import History, fit
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def train_tracker(
         weights: ``track``, ``state``, ``control`` of :class:`LossWeights`.
         tube: reachability-aware part, None for the paper's plain loss.
         tube_steps: further gradient steps with the reachability-aware part, from the plainly trained tracker.
-        checkpoint, identity, progress: see :func:`sagemp_cli.training.fit`.
+        checkpoint, identity, progress: see :func:`sagemp_cli.learning.fit.fit`.
     """
     horizon = references.shape[1] - 1
     if not 1 <= rollout_steps <= horizon:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.policy import Tracker
 
 WIDEST = 1e6
 """Width from which on a tube counts as exploded, in any unit; its gradient says nothing any more."""

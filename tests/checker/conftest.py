@@ -12,17 +12,17 @@ import h5py
 import pytest
 import torch
 
-from sagemp_cli.binding import target_class
-from sagemp_cli.models import weights_of
-from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.verification import verify_references
+from sagemp_cli.config.binding import target_class
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.pipeline.models import weights_of
+from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Box
-from sagemp_cli.stages.problem import Problem
-from sagemp_cli.stages.tubes import tubes_record
 from sagemp_cli.storage import Certificate, Header, Tubes, write_artifact
 from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.verification.problem import Problem
+from sagemp_cli.verification.verification import verify_references
 
 LIMITS = {"unicycle": (4, 2), "planar_quadrotor": (6, 2), "quadrotor": (12, 4)}
 CLASSES = {"unicycle": "Unicycle", "planar_quadrotor": "PlanarQuadrotor", "quadrotor": "Quadrotor"}

@@ -7,10 +7,10 @@ import h5py
 import torch
 
 from sagemp_cli.checker.check import check
-from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.verification import verify_references
+from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes.scene import scene_from_mapping
-from sagemp_cli.stages.tubes import tubes_record
+from sagemp_cli.verification.verification import verify_references
 
 
 def test_an_adaptive_partition_is_proved_and_one_with_a_gap_is_not(make, mutate, tmp_path):

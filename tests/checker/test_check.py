@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.cli.main import app
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
 from sagemp_cli.storage import Counterexample
 from sagemp_cli.storage.content import content_hash

@@ -10,12 +10,12 @@ import torch
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.models import weights_of
-from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.deviation import Folded, split
-from sagemp_cli.reachability.verification import verify_references
-from sagemp_cli.stages.tubes import tubes_record
+from sagemp_cli.pipeline.models import weights_of
+from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import TrueModel
+from sagemp_cli.verification.deviation import Folded, split
+from sagemp_cli.verification.verification import verify_references
 
 FIRST = "data/dynamics/layers.0.weight"
 

@@ -17,11 +17,11 @@ import torch
 import yaml
 
 from sagemp_cli.checker.check import check
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.policy import Tracker
 
 WANTED = {
     "tube": 50, "relaxation": 80, "product": 30, "weight": 50, "reference": 25, "cell": 30, "start": 25,

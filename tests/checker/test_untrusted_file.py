@@ -9,8 +9,8 @@ import torch
 import yaml
 
 from sagemp_cli.checker.check import check
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.storage import Counterexample
 
 HUGE = 10**400

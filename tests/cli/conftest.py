@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sagemp_cli import config as config_module
 from sagemp_cli.cli.main import app
-from sagemp_cli.stages.stage import STAGES
+from sagemp_cli.config import composition as config_module
+from sagemp_cli.pipeline.stage import STAGES
 
 _composed = functools.cache(config_module._composed)
 

@@ -13,7 +13,7 @@ import time
 import pytest
 
 from sagemp_cli.errors import EXIT_INTERRUPTED, EXIT_UNKNOWN
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Tube
 
 

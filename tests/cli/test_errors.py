@@ -66,7 +66,7 @@ def test_config_validate_checks_every_option(sagemp):
 def test_config_show_prints_what_compose_makes(sagemp):
     import yaml
 
-    from sagemp_cli.config import compose
+    from sagemp_cli.config.composition import compose
 
     assert yaml.safe_load(sagemp("config", "show", "seed=3").stdout) == compose(["seed=3"])
 

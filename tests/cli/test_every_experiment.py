@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sagemp_cli.cli.main import app
-from sagemp_cli.config import options_of
+from sagemp_cli.config.composition import options_of
 from sagemp_cli.storage import Certificate, read_artifact
 
 SMALL = {  # beside effort=toy: networks and training of planners that the neural ODE's sizes do not fit

@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import pytest
 
-from sagemp_cli.config import compose
-from sagemp_cli.stages.stage import STAGES, stages_of
+from sagemp_cli.config.composition import compose
+from sagemp_cli.pipeline.stage import STAGES, stages_of
 
 NAMES = [stage.name for stage in stages_of(compose([]))]
 FOLDER = Path("artifacts/unicycle_node")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sagemp_cli.binding import build
-from sagemp_cli.config import compose, options_of
+from sagemp_cli.config.binding import build
+from sagemp_cli.config.composition import compose, options_of
 from sagemp_cli.dynamics import Dynamics
 
 ROBOTS = [name for name in options_of("dynamics") if not name.endswith("_learned")]

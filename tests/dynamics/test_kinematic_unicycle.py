@@ -7,12 +7,12 @@ import math
 import numpy as np
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.experts import Expert, Weights, plan_demonstrations, solve_problem
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import scene_from_mapping
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.policy import Tracker
 
 
 def test_the_derivative_is_that_of_the_equations(make_robot):

@@ -5,8 +5,8 @@ import copy
 import pytest
 import torch
 
-from sagemp_cli.binding import build
-from sagemp_cli.config import compose, options_of
+from sagemp_cli.config.binding import build
+from sagemp_cli.config.composition import compose, options_of
 from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.dynamics.learned import ACTIVATIONS
 from sagemp_cli.errors import ConfigError
@@ -74,7 +74,7 @@ def test_the_deviation_is_what_w_must_change_by_to_make_the_models_step(section,
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_its_step_is_enclosed_with_every_activation(section, activation):
-    from sagemp_cli.reachability.affine import Affine
+    from sagemp_cli.reachability.affine.affine import Affine
     from sagemp_cli.sets import Box
 
     robot = build(section | {"activation": activation}, "dynamics")
@@ -106,7 +106,7 @@ def test_its_step_is_enclosed_with_every_activation(section, activation):
             r"dynamics.activation must be one of leaky_relu, .*, found 'tan' \(did you mean 'tanh'",
         ),
         (
-            {"model": {"_target_": "sagemp_cli.trackers.policy.Tracker"}},
+            {"model": {"_target_": "sagemp_cli.loop.tracker.Tracker"}},
             "must be an analytical robot model, found Tracker",
         ),
         ({"model": {"_target_": "os.system"}}, "dynamics.model._target_ 'os.system' is not allowed"),

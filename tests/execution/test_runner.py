@@ -1,17 +1,17 @@
 import pytest
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution import execute_queries, inside_tube, random_disturbances, worst_case_disturbances
-from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.refutation import SoundnessError, attack
-from sagemp_cli.reachability.verdict import Outcome, Verdict
-from sagemp_cli.reachability.verification import verify_references
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.verification.attack.refutation import SoundnessError, attack
+from sagemp_cli.verification.verdict import Outcome, Verdict
+from sagemp_cli.verification.verification import verify_references
 
 K = 20
 

@@ -10,10 +10,10 @@ import torch
 from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution import DISTURBANCES, OpenLoop, Trials, require_certified_safe, try_references
-from sagemp_cli.reachability.refutation import SoundnessError
+from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.policy import Tracker
+from sagemp_cli.verification.attack.refutation import SoundnessError
 
 K, DT = 20, 0.1
 SCENE = Scene(Box([-3.0, -3.0], [5.0, 3.0]), (Ball((1.0, 1.2), 0.3, "disc"),), Box([1.5, -0.5], [2.5, 0.5]))

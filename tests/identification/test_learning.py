@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sagemp_cli.binding import build
+from sagemp_cli.config.binding import build
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification import EnclosureWeight, Transitions, domain_of, learn_dynamics
 from sagemp_cli.identification.enclosure_loss import enclosure_error
@@ -101,7 +101,7 @@ def test_the_enclosure_loss_makes_boxes_cheaper_to_enclose(robot):
 
 
 def test_the_enclosure_error_is_nearly_what_the_propagator_adds():
-    from sagemp_cli.reachability.affine import Affine
+    from sagemp_cli.reachability.affine.affine import Affine
     from sagemp_cli.sets import Box
 
     torch.manual_seed(0)

@@ -6,10 +6,10 @@ import torch
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.library import REASONS, build_library
 from sagemp_cli.library.builder import NothingCertifiedError, reference_faults
-from sagemp_cli.reachability.verdict import Outcome, Verdict
-from sagemp_cli.reachability.verification import Verification
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.verdict import Outcome, Verdict
+from sagemp_cli.verification.verification import Verification
 
 K, POSITION = 4, (0, 1)
 SCENE = Scene(Box([-5.0, -5.0], [5.0, 5.0]), (Ball((2.0, 2.0), 0.5, "disc"),), Box([3.0, -1.0, -9.0], [5.0, 1.0, 9.0]))

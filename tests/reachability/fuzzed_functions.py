@@ -19,8 +19,8 @@ from typing import Any
 import torch
 
 from sagemp_cli.errors import SagempError
-from sagemp_cli.reachability.tracing.program import Recorder
-from sagemp_cli.reachability.tracing.value import Traced
+from sagemp_cli.reachability.program.program import Recorder
+from sagemp_cli.reachability.program.value import Traced
 
 NAMESPACES = (
     "torch", "torch.Tensor", "torch.nn.functional", "torch.func", "torch.linalg", "torch.special", "torch.fft",

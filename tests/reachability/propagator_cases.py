@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.dynamics import Unicycle
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
 

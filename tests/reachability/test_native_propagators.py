@@ -4,15 +4,15 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from inner import attack_tube, inner_estimate
 from torch import Tensor
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
-from sagemp_cli.reachability.affine import Affine
-from sagemp_cli.reachability.best import Best
-from sagemp_cli.reachability.crown import Crown
-from sagemp_cli.reachability.inner import attack_tube, inner_estimate
-from sagemp_cli.reachability.interval import Interval
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.crown.best import Best
+from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.sets import Box
 
 from .propagator_cases import DISTURBANCE, START, AffineLoop, EveryOperation, line, rollouts, unicycle_loop

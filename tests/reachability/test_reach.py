@@ -19,7 +19,7 @@ from torch import nn
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability import reach
 from sagemp_cli.reachability.any_loop import PROPAGATORS
-from sagemp_cli.reachability.lirpa_adapter import find
+from sagemp_cli.reachability.lirpa.adapter import find
 from sagemp_cli.sets import Box
 
 K = 6
@@ -732,7 +732,7 @@ def test_a_propagator_that_lies_is_caught_by_the_rollouts():
         name, rigorous = "liar", True
 
         def propagate(self, loop, start, disturbance):
-            from sagemp_cli.reachability.affine import Affine
+            from sagemp_cli.reachability.affine.affine import Affine
             from sagemp_cli.sets import Tube
 
             tube = Affine().propagate(loop, start, disturbance)

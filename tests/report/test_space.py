@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpl_toolkits.mplot3d import Axes3D
 
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.report.canvas import Setting, blank_figure
 from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.space import box_faces, space_axes, space_tube

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sagemp_cli.config import compose
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.config.composition import compose
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.stage import stage_named
 
 
 def assert_same(a: Any, b: Any) -> None:

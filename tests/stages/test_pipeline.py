@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
-from sagemp_cli.models import planner_from, tracker_from
-from sagemp_cli.stages.problem import problem_of
-from sagemp_cli.stages.stage import STAGES, stage_named
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.pipeline.models import planner_from, tracker_from
+from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.pipeline.stage import STAGES, stage_named
 from sagemp_cli.storage import read_artifact
 
 from .conftest import assert_same

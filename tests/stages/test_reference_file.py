@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from sagemp_cli.errors import ArtifactError, NonFiniteError, UsageError
-from sagemp_cli.stages.freshness import Freshness, survey
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.reference_file import read_references
-from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.pipeline.freshness import Freshness, survey
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.reference_file import read_references
+from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.storage import Certificate, read_artifact, sha256_of
 
 from .conftest import Interrupt, assert_same

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from sagemp_cli.errors import ArtifactError, ResourceError
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.storage import Demonstrations, PlannerModel, TrackerModel, read_artifact
 
 from .conftest import Interrupt, assert_same

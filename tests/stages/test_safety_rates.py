@@ -8,14 +8,14 @@ import torch
 
 from sagemp_cli.dynamics.inverse import invert
 from sagemp_cli.errors import ConfigError, UsageError
-from sagemp_cli.reachability.refutation import SoundnessError
-from sagemp_cli.reachability.verdict import Outcome
+from sagemp_cli.pipeline.partial import PartialResults
+from sagemp_cli.pipeline.problem import problem_of, trained_problem
+from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.stage import stage_named, stages_of
 from sagemp_cli.stages import safety_rates
-from sagemp_cli.stages.partial import PartialResults
-from sagemp_cli.stages.problem import problem_of, trained_problem
-from sagemp_cli.stages.proof import Proof
-from sagemp_cli.stages.stage import stage_named, stages_of
 from sagemp_cli.storage import SafetyRates, read_artifact
+from sagemp_cli.verification.attack.refutation import SoundnessError
+from sagemp_cli.verification.verdict import Outcome
 
 from .conftest import Interrupt, assert_same
 

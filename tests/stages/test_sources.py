@@ -2,12 +2,12 @@
 
 import pytest
 
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.freshness import Freshness, survey
-from sagemp_cli.stages.requirements import require_sound_config
-from sagemp_cli.stages.stage import stage_named, stages_of
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.freshness import Freshness, survey
+from sagemp_cli.pipeline.requirements import require_sound_config
+from sagemp_cli.pipeline.stage import stage_named, stages_of
 
 
 def context(tmp_path, *overrides):

@@ -8,13 +8,13 @@ import torch
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.cli import verdict
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
-from sagemp_cli.models import robot_from, tracker_from
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.problem import problem_of, robot_of, trained_problem
-from sagemp_cli.stages.requirements import require_sound_config
-from sagemp_cli.stages.stage import stage_named
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.models import robot_from, tracker_from
+from sagemp_cli.pipeline.problem import problem_of, robot_of, trained_problem
+from sagemp_cli.pipeline.requirements import require_sound_config
+from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.storage import DynamicsModel, read_artifact
 
 EXPERIMENT = ("experiment=unicycle_node_learned", "effort=toy", "dynamics.hidden=[16,16]")
@@ -61,7 +61,7 @@ def test_the_certificate_is_about_both_models_and_checks_from_the_file_alone(con
 
 
 def test_no_rollout_of_either_model_leaves_its_tube(context):
-    from sagemp_cli.closed_loop import ClosedLoop
+    from sagemp_cli.loop.closed_loop import ClosedLoop
 
     record = verdict.read_certificate(context.output_path("verify")).record
     problem, _ = trained_problem(context)

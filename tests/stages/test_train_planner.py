@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from sagemp_cli.config import compose
+from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
-from sagemp_cli.models import planner_from
+from sagemp_cli.learning.fit import History
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.freshness import Freshness, survey
+from sagemp_cli.pipeline.models import planner_from
+from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.pipeline.requirements import require_sound_config
+from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.planners import NeuralODE
-from sagemp_cli.stages.context import StageContext
-from sagemp_cli.stages.freshness import Freshness, survey
-from sagemp_cli.stages.problem import problem_of
-from sagemp_cli.stages.requirements import require_sound_config
-from sagemp_cli.stages.stage import stage_named
 from sagemp_cli.storage import PlannerModel, read_artifact, sha256_of
-from sagemp_cli.training import History
 
 from .conftest import Interrupt
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.stages.tubes import tubes_record, verification_of
+from sagemp_cli.pipeline.tubes import tubes_record, verification_of
 from sagemp_cli.storage import Library, read_artifact
 
 from .conftest import assert_same

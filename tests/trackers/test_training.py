@@ -7,8 +7,8 @@ import re
 import pytest
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.progress import Silent
 from sagemp_cli.trackers.training import RolloutSampler, train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss

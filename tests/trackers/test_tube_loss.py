@@ -7,9 +7,9 @@ import re
 import pytest
 import torch
 
-from sagemp_cli.closed_loop import ClosedLoop
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.reachability.affine import Affine
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
 

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.binding import options_for
+from sagemp_cli.config.binding import options_for
 from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.vlm.answer import MOST_WAYPOINTS, AnswerError, waypoints_of
 from sagemp_cli.planners.vlm.gemini import Gemini
@@ -31,7 +32,6 @@ from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.frame import Frame
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.training import History, fit
 
 PROVIDERS = ("local", "gemini", "openai", "replay")
 SERVICE_PLANS = 4
@@ -241,7 +241,7 @@ class VLM(nn.Module):
             held_out: random scenes for the figures.
             batch: scenes per update.
             margin: distance to obstacles that is learned, as a share of half the picture.
-            learning_rate: see :func:`sagemp_cli.training.fit`.
+            learning_rate: see :func:`sagemp_cli.learning.fit.fit`.
             ema_decay: see there.
             checkpoint: see there.
             identity: see there.

@@ -9,12 +9,6 @@ from torch import Tensor
 
 from sagemp_cli.reachability.relaxations.functions import functions_of
 
-UNIT = 2.0**-53
-"""Unit roundoff of float64: a correctly rounded operation errs by at most ``UNIT`` times its result."""
-
-TINY = 1e-250
-"""Absorbs underflow: far above every subnormal error, far below everything of interest."""
-
 
 class Band(NamedTuple):
     """``|f(x) - slope x - offset| <= radius`` for every real x of the interval, in real arithmetic.

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.sets.rounding import TINY, UNIT
 
 
 def band(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor) -> Band:

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.value_range import increasing, outward
+from sagemp_cli.sets.rounding import TINY, UNIT
 
 
 def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None = None) -> Band:

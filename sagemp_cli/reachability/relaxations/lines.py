@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.relaxations.band import UNIT, Band
+from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.sets.rounding import UNIT
 
 
 class Lines(NamedTuple):

@@ -27,9 +27,10 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.sets.rounding import TINY, UNIT
 
 _GOOD = 2e-4  # a slope whose objective is this close to the best, in units of the excess's range, is not refined
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import tanh
-from sagemp_cli.reachability.relaxations.band import UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
+from sagemp_cli.sets.rounding import UNIT
 
 
 def band(lower: Tensor, upper: Tensor) -> Band:

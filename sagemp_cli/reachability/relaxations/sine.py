@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
-from sagemp_cli.reachability.relaxations.band import UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import (
@@ -31,6 +31,7 @@ from sagemp_cli.reachability.relaxations.pieces import (
     radius_objective,
     upper_objective,
 )
+from sagemp_cli.sets.rounding import UNIT
 
 ULPS = 4
 """Margin for torch's and numpy's ``sin, cos, acos, asin``, in ulps of 1; tested against ball arithmetic."""

@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import pieces
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT, Band, settled
+from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
+from sagemp_cli.sets.rounding import TINY, UNIT
 
 ULPS = 4
 """Margin for the formulas below, in ulps of the result; tested against ball arithmetic."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.relaxations.band import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, UNIT
 
 
 def outward(least: Tensor, most: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from sagemp_cli.config import load_scene
+from sagemp_cli.config.composition import load_scene
 from sagemp_cli.planners.vlm import VLM
 from sagemp_cli.scenes import Frame, Scene, scene_from_mapping
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.learning.fit import fit
 from sagemp_cli.planners.vlm.lessons import Lessons, along, answers_to
 from sagemp_cli.planners.vlm.network import SceneReader, cell_middles
 from sagemp_cli.planners.vlm.practice import SQUARE, Exercise, practice_of, random_exercise
@@ -13,7 +14,6 @@ from sagemp_cli.planners.vlm.prompts import template
 from sagemp_cli.planners.vlm.search import waypoints_on
 from sagemp_cli.planners.vlm.words import WORDS, bag_of_words
 from sagemp_cli.scenes import Ball, Scene
-from sagemp_cli.training import fit
 
 START, GOAL = np.array([-0.8, 0.0]), np.array([0.8, 0.0])
 FREE = np.zeros((24, 24))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from sagemp_cli.binding import build
-from sagemp_cli.config import compose
+from sagemp_cli.config.binding import build
+from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM
 from sagemp_cli.sets import Box

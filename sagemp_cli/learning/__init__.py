@@ -1,0 +1,1 @@
+"""What every training shares: the one loop that fits a module to a loss, and its checkpoints."""

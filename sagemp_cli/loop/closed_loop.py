@@ -1,0 +1,149 @@
+"""The tracking neural feedback loop (T-NFL, Algorithm 1 of the paper).
+
+Indices (the paper's Algorithm 1 slips here, see ``docs/glossary.md``): states ``x_0..x_K`` with ``x_0`` the
+start, references ``p_0..p_K`` with ``p_0`` the reference's start; step ``k = 0..K-1`` reads
+``p_{k+1}..p_{k+N}``, padded with ``p_K``, and the disturbance ``w_k``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.loop.tracker import Tracker
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Dynamics, tracker and fixed references put together; ``step`` is the one-step map ``f(x, pi(e), w)``.
+
+    Attributes:
+        dynamics: the robot.
+        tracker: the policy ``u = pi(e)``.
+        references: ``(..., K+1, n)``; leading dimensions are batch and broadcast against those of the state.
+    """
+
+    dynamics: Dynamics
+    tracker: Tracker
+    references: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.dynamics.state_dim
+        if self.references.dim() < 2 or self.references.shape[-1] != n or self.references.shape[-2] < 2:
+            raise UsageError(
+                f"references must have shape (..., K+1, {n}) with K >= 1, found {tuple(self.references.shape)}"
+            )
+        if not bool(torch.isfinite(self.references).all()):
+            raise NonFiniteError("a reference contains NaN or infinity")
+        if self.tracker.state_dim != n or self.tracker.control_dim != self.dynamics.control_dim:
+            raise UsageError(
+                f"tracker maps {self.tracker.state_dim} states to {self.tracker.control_dim} controls, "
+                f"but the robot has {n} and {self.dynamics.control_dim}"
+            )
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps K."""
+        return self.references.shape[-2] - 1
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+        return self.dynamics.state_dim
+
+    def window(self, k: int) -> Tensor:
+        """The lookahead ``p_{k+1}..p_{k+N}``, padded with ``p_K``, shape ``(..., N, n)``."""
+        index = torch.arange(k + 1, k + 1 + self.tracker.lookahead).clamp(max=self.horizon)
+        return self.references[..., index, :]
+
+    def control(self, k: int, x: Tensor) -> Tensor:
+        """``u_k = pi(e_k)`` with ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]`` (equation 6)."""
+        return self.control_given(self.window(k), x)
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
+        return self.dynamics.step(x, self.control(k, x), w)
+
+    given_dim: ClassVar[int] = 2
+
+    def given(self, k: int) -> Tensor:
+        """What step k has of its own: its window."""
+        return self.window(k)
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state and the control ``u_k``, for a window."""
+        u = self.control_given(given, x)
+        return self.dynamics.step(x, u, w), u
+
+    def control_given(self, given: Tensor, x: Tensor) -> Tensor:
+        """``u_k``, for a window."""
+        return self.tracker(given - x[..., None, :])
+
+    def folded(self) -> FoldedLoop:
+        """The same loop with the tracker's first layer folded onto the fixed references."""
+        folds = [self.tracker.folded(self.window(k)) for k in range(self.horizon)]
+        biases = torch.stack([bias for _, bias in folds], dim=-2)
+        return FoldedLoop(self.dynamics, self.tracker, folds[0][0], biases)
+
+    def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Algorithm 1: states ``(..., K+1, n)`` and controls ``(..., K, m)`` from starts and disturbances.
+
+        Args:
+            x: starts ``(..., n)``.
+            w: disturbances ``(..., K, n)``; fewer rows give a shorter rollout.
+        """
+        states, controls = [x], []
+        for k in range(w.shape[-2]):
+            controls.append(self.control(k, states[-1]))
+            states.append(self.dynamics.step(states[-1], controls[-1], w[..., k, :]))
+        return torch.stack(states, dim=-2), torch.stack(controls, dim=-2)
+
+
+@dataclass(frozen=True)
+class FoldedLoop:
+    """A closed loop whose lookahead costs nothing: step k's first layer is ``weight @ x_k + biases[k]``.
+
+    Equal to the loop it was folded from in exact arithmetic (the sums over the lookahead are done once); in
+    floating point it differs by rounding, so what is proved of one holds for the other up to that.
+
+    Attributes:
+        dynamics: the robot.
+        tracker: the policy; only its layers after the first are used.
+        weight: ``(h, n)``, the same at every step.
+        biases: ``(..., K, h)``; leading dimensions are those of the references.
+    """
+
+    dynamics: Dynamics
+    tracker: Tracker
+    weight: Tensor
+    biases: Tensor
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps K."""
+        return self.biases.shape[-2]
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+        return self.dynamics.state_dim
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
+        return self.step_given(self.given(k), x, w)[0]
+
+    given_dim: ClassVar[int] = 1
+
+    def given(self, k: int) -> Tensor:
+        """What step k has of its own: the bias of its first layer."""
+        return self.biases[..., k, :]
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state and the control, for a bias."""
+        u = self.tracker.after_first(torch.nn.functional.linear(x, self.weight) + given)
+        return self.dynamics.step(x, u, w), u

@@ -1,0 +1,112 @@
+"""Trained modules to records and back; a record is data, never code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from sagemp_cli.config.binding import FROM_DATA, build, parameters_of, target_class
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.learned import Learned
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.learning.fit import History
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.planners.base import Planner
+from sagemp_cli.storage import Artifact, DynamicsModel, PlannerModel, TrackerModel, TrainingCurve
+
+
+def weights_of(module: nn.Module) -> dict[str, np.ndarray]:
+    """Parameters and buffers by name."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in module.state_dict().items()}
+
+
+def data_arguments(section: Mapping[str, Any], where: str, dynamics: Dynamics, horizon: int) -> dict[str, Any]:
+    """Those constructor arguments of a section's class that come from the robot and the horizon."""
+    known = {
+        "state_dim": dynamics.state_dim,
+        "state_names": list(dynamics.state_names),
+        "control_dim": dynamics.control_dim,
+        "horizon": horizon,
+        "dt": dynamics.dt,
+    }
+    wanted = parameters_of(target_class(section, where))
+    return {key: known[key] for key in FROM_DATA if key in wanted}
+
+
+def planner_from(artifact: Artifact[PlannerModel]) -> Planner:
+    """The trained planner, built from the artifact's own config."""
+    extra = _arguments(artifact.record.arguments, artifact)
+    section = {"_target_": artifact.header.config["planner"].get("_target_")}
+    module = build(section, "planner", **extra)
+    return _loaded(module, artifact.record.weights, artifact)
+
+
+def robot_from(artifact: Artifact[DynamicsModel], robot: Learned) -> Learned:
+    """A learned robot with the weights of the artifact, which are those of a robot of another section at your risk:
+    only names and shapes are compared.
+    """
+    return _loaded(robot, artifact.record.weights, artifact)
+
+
+def stand_in(config: Mapping[str, Any]) -> str:
+    """What takes the place of the real thing in an experiment's plans, in a few words; empty if nothing does."""
+    from_file = config.get("verify", {}).get("file") is not None
+    said = getattr(target_class(config["planner"], "planner"), "stand_in", None)
+    return "" if said is None or from_file else said(config["planner"])
+
+
+def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:
+    """The trained tracker."""
+    module = Tracker(**_arguments(artifact.record.arguments, artifact))
+    return _loaded(module, artifact.record.weights, artifact)
+
+
+def curve_of(history: History) -> TrainingCurve:
+    """A training run's figures in one table: loss, what was reported beside it, validation figures."""
+    steps = np.arange(len(history.loss), dtype=np.int64)
+    columns = {"loss": history.loss, **{name: history.figures[name] for name in sorted(history.figures)}}
+    for name, values in sorted(history.validation.items()):
+        column = np.full(len(steps), np.nan)
+        # A validation after v updates belongs to the last of them.
+        column[np.asarray(history.validated_at) - 1] = values
+        columns[f"validation {name}"] = column
+    values = np.stack([np.asarray(column, dtype=np.float64) for column in columns.values()], axis=1)
+    return TrainingCurve(step=steps, names=tuple(columns), values=values)
+
+
+def figures_at_end(history: History) -> dict[str, float]:
+    """A model card: the last validation's figures, and the last twentieth's mean of what every update measured."""
+    tail = max(1, len(history.loss) // 20)
+    figures = {"loss": float(np.mean(history.loss[-tail:]))}
+    for name, values in sorted(history.figures.items()):
+        measured = values[-tail:][np.isfinite(values[-tail:])]
+        if len(measured):
+            figures[name] = float(measured.mean())
+    return figures | {name: float(values[-1]) for name, values in sorted(history.validation.items())}
+
+
+def _arguments(text: str, artifact: Artifact[Any]) -> dict[str, Any]:
+    try:
+        arguments = json.loads(text)
+    except json.JSONDecodeError as e:
+        raise ArtifactError(f"{artifact.path}: constructor arguments are not JSON ({e})") from None
+    if not isinstance(arguments, dict):
+        raise ArtifactError(f"{artifact.path}: arguments must be a mapping, found {type(arguments).__name__}")
+    return arguments
+
+
+def _loaded(module: Any, weights: Mapping[str, np.ndarray], artifact: Artifact[Any]) -> Any:
+    wanted = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    found = {name: value.shape for name, value in weights.items()}
+    if wanted != found:
+        odd = next(k for k in {**wanted, **found} if wanted.get(k) != found.get(k))
+        raise ArtifactError(
+            f"{artifact.path}: weight '{odd}' has shape {found.get(odd)}, the model needs {wanted.get(odd)}"
+        )
+    module.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    return module.eval()

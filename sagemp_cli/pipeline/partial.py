@@ -1,0 +1,130 @@
+"""Finished pieces of a long stage, kept until its output is written, so that an interrupted run resumes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagemp_cli import __version__
+from sagemp_cli.errors import ResourceError
+from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.stage import stage_named
+from sagemp_cli.storage import Artifact, Parent
+
+Inputs = Sequence[Artifact[Any] | Parent]
+
+
+def work_identity(context: StageContext, stage: str, inputs: Inputs = (), *, without: Sequence[str] = ()) -> str:
+    """A hash of everything that a stage's result depends on: its config sections, its inputs and the version.
+
+    Args:
+        context: gives the config.
+        stage: name of the stage.
+        inputs: artifacts and other files that it is made from.
+        without: dotted keys that finished pieces do not depend on.
+    """
+    config = stage_named(stage).settings(context.config, without=without)
+    data = [__version__, stage, config, sorted((p.role, p.sha256) for p in context.parents(inputs))]
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class PartialResults:
+    """Numbered pieces as NPZ files without pickles, in a folder that is named after the work's identity.
+
+    Attributes:
+        folder: ``<stage's partial folder>/<identity>``; pieces of other work beside it are removed.
+    """
+
+    folder: Path
+
+    @classmethod
+    def of(
+        cls, context: StageContext, stage: str, inputs: Inputs = (), *, without: Sequence[str] = ()
+    ) -> PartialResults:
+        """Open the pieces of a stage, dropping those that a changed config or input has made stale."""
+        identity = work_identity(context, stage, inputs, without=without)
+        return cls(_folder_of_its_own(context.partial_folder(stage), identity))
+
+    @property
+    def finished(self) -> set[int]:
+        """Numbers of the finished pieces."""
+        return {int(p.stem) for p in self.folder.glob("*.npz") if p.stem.isdigit()}
+
+    def save(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep a finished piece; it is there wholly or not at all."""
+        temporary = self.folder / f"{index:06d}.{os.getpid()}.tmp"
+        try:
+            with temporary.open("wb") as f:
+                np.savez(f, **arrays)
+            os.replace(temporary, self._path(index))
+        except OSError as e:
+            temporary.unlink(missing_ok=True)
+            raise ResourceError(f"{self.folder}: cannot be written: {e.strerror or e}") from e
+
+    def load(self, index: int) -> dict[str, np.ndarray]:
+        """Read a finished piece.
+
+        Raises:
+            ResourceError: it is damaged; it is deleted so that the next run makes it again.
+        """
+        path = self._path(index)
+        try:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
+        except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError) as e:
+            path.unlink(missing_ok=True)
+            raise ResourceError(f"{path}: damaged piece, deleted; run the stage again to make it anew ({e})") from None
+
+    def remove(self) -> None:
+        """Remove all pieces: the stage's output is written."""
+        shutil.rmtree(self.folder.parent)
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.npz"
+
+
+@dataclass(frozen=True)
+class PartialFile:
+    """The checkpoint of a training stage.
+
+    Attributes:
+        path: the file; it is removed when the work that it belongs to has changed.
+        identity: what the checkpoint must say.
+    """
+
+    path: Path
+    identity: str
+
+    @classmethod
+    def of(cls, context: StageContext, stage: str, inputs: Inputs = ()) -> PartialFile:
+        """Where the stage's checkpoint is; a checkpoint of other work beside it is removed."""
+        identity = work_identity(context, stage, inputs)
+        results = _folder_of_its_own(context.partial_folder(stage), identity)
+        return cls(results / "checkpoint.h5", identity)
+
+    def remove(self) -> None:
+        """Remove the checkpoint: the stage's output is written."""
+        shutil.rmtree(self.path.parent.parent)
+
+
+def _folder_of_its_own(parent: Path, identity: str) -> Path:
+    """Make ``parent/identity`` and remove whatever else is in ``parent``: it belongs to work that has changed."""
+    folder = parent / identity
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for other in parent.iterdir():
+            if other != folder:
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
+    except OSError as e:
+        raise ResourceError(f"{parent}: cannot be written: {e.strerror or e}") from e
+    return folder

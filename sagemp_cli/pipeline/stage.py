@@ -1,0 +1,215 @@
+"""What a stage is: which files it reads, which file it writes, which config keys its output depends on.
+
+A stage opens artifacts, builds objects from config, calls the core and writes one file; the mathematics is
+elsewhere. The table :data:`STAGES` is all that ``run``, ``status`` and the commands know about them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from sagemp_cli.config.binding import target_class
+from sagemp_cli.dynamics.learned import Learned
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.storage import (
+    Certificate,
+    Demonstrations,
+    DynamicsModel,
+    Library,
+    PlannerModel,
+    Rollouts,
+    SafetyRates,
+    TrackerModel,
+    refuse_existing,
+)
+
+if TYPE_CHECKING:
+    from sagemp_cli.pipeline.context import StageContext
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline.
+
+    Attributes:
+        name: the command.
+        output: file name of what it writes, in the experiment's folder.
+        record: record class of that file.
+        inputs: names of the stages whose outputs it reads, where those apply.
+        sections: dotted config keys that its output depends on, beyond those of its inputs.
+        irrelevant: keys in these sections that only say where the work is done, and change nothing in the output.
+        applies: whether an experiment has this stage at all, from its config.
+    """
+
+    name: str
+    output: str
+    record: type
+    inputs: tuple[str, ...]
+    sections: tuple[str, ...]
+    irrelevant: tuple[str, ...] = ()
+    applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
+
+    def inputs_in(self, config: Mapping[str, Any]) -> tuple[str, ...]:
+        """Names of the stages whose outputs it reads in an experiment."""
+        return tuple(name for name in self.inputs if stage_named(name).applies(config))
+
+    def settings(self, config: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:
+        """What its output depends on in a config: its sections by their keys, None where one is absent.
+
+        Args:
+            config: resolved config.
+            without: further keys in these sections to leave out.
+        """
+        return {key: _value(config, key, without=(*self.irrelevant, *without)) for key in self.sections}
+
+    def difference(self, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+        """The first dotted key that its output depends on and that differs in two configs, with both values."""
+        before, now = self.settings(found), self.settings(wanted)
+        return next((_difference(key, before[key], now[key]) for key in now if before[key] != now[key]), None)
+
+    @property
+    def role(self) -> str:
+        """Name of the output among the parents of another artifact."""
+        return self.output.removesuffix(".h5")
+
+    def run(self, context: StageContext) -> Path:
+        """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote.
+
+        Raises:
+            ConfigError: another experiment makes the file, or the stage has :meth:`complaints`.
+        """
+        owner = context.owner(self.name)
+        if owner is not context:
+            raise ConfigError(
+                f"sources.{self.name}: {context.config['name']} takes {self.output} from {owner.config['name']}; "
+                f"make it with 'sagemp {self.name} experiment={owner.config['name']}'"
+            )
+        refuse_existing(context.output_path(self.name), context.overwrite)
+        wrong = self.complaints(context.config)
+        if wrong:
+            raise ConfigError("; ".join(wrong))
+        return self._module.run(context)
+
+    def complaints(self, config: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the sections that this stage reads and no class is built from, one line each."""
+        return self._module.complaints(config)
+
+    @property
+    def _module(self) -> ModuleType:
+        return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}")
+
+
+def _has_demonstrations(config: Mapping[str, Any]) -> bool:
+    """Whether the planner learns from an expert; one of a file or one that teaches itself does not."""
+    return getattr(target_class(config["planner"], "planner"), "learns_from", None) == "demonstrations"
+
+
+def _learns_its_robot(config: Mapping[str, Any]) -> bool:
+    """Whether the robot is a learned one."""
+    return target_class(config["dynamics"], "dynamics") is Learned
+
+
+_ROBOT = ("name", "dynamics", "scene", "horizon")
+# Memory decides which cells are propagated together, which changes the last bits of their tubes.
+_PARTITION = ("verify.partitions", "verify.budget", "verify.memory")
+
+STAGES = (
+    Stage(
+        "gen-data",
+        "demonstrations.h5",
+        Demonstrations,
+        (),
+        (*_ROBOT, "expert", "start", "seed"),
+        irrelevant=("expert.processes",),
+        applies=_has_demonstrations,
+    ),
+    Stage(
+        "train-dynamics",
+        "dynamics.h5",
+        DynamicsModel,
+        (),
+        ("name", "dynamics", "dynamics_training", "seed"),
+        applies=_learns_its_robot,
+    ),
+    Stage("train-planner", "planner.h5", PlannerModel, ("gen-data",), (*_ROBOT, "planner", "planner_training", "seed")),
+    Stage(
+        "train-tracker",
+        "tracker.h5",
+        TrackerModel,
+        ("train-dynamics", "train-planner"),
+        (*_ROBOT, "tracker", "training", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "verify",
+        "certificate.h5",
+        Certificate,
+        ("train-dynamics", "train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", "verify", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "build-library",
+        "library.h5",
+        Library,
+        ("train-dynamics", "train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "execute",
+        "rollouts.h5",
+        Rollouts,
+        ("train-dynamics", "train-planner", "train-tracker", "build-library"),
+        (*_ROBOT, "execute", "start", "disturbance", "seed"),
+    ),
+    Stage(
+        "safety-rates",
+        "safety.h5",
+        SafetyRates,
+        ("train-dynamics", "train-planner", "train-tracker"),
+        (*_ROBOT, "propagator", *_PARTITION, "library.start_spread", "safety", "start", "disturbance", "seed"),
+    ),
+)
+
+
+def stage_named(name: str) -> Stage:
+    """The stage of a command."""
+    return next(s for s in STAGES if s.name == name)
+
+
+def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "build-library", "execute")) -> list[Stage]:
+    """The stages that an experiment's ``last`` ones need, in order, themselves included.
+
+    Those that are not among the default ``last`` ones are made only when they are asked for by name. Of a stage whose
+    file another experiment makes, the inputs are that experiment's affair.
+    """
+    needed: set[str] = set()
+    waiting = list(last)
+    while waiting:
+        name = waiting.pop()
+        if name not in needed:
+            needed.add(name)
+            if config["sources"].get(name) is None:
+                waiting += stage_named(name).inputs_in(config)
+    return [stage for stage in STAGES if stage.name in needed]
+
+
+def _value(config: Mapping[str, Any], dotted: str, *, without: Sequence[str]) -> Any:
+    node: Any = config
+    for part in dotted.split("."):
+        node = node.get(part) if isinstance(node, Mapping) else None
+    if isinstance(node, Mapping):
+        return {key: value for key, value in node.items() if f"{dotted}.{key}" not in without}
+    return node
+
+
+def _difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for k in [*wanted, *(k for k in found if k not in wanted)]:
+            old, new = found.get(k, "nothing"), wanted.get(k, "nothing")
+            if old != new:
+                return _difference(f"{key}.{k}", old, new)
+    return key, found, wanted

@@ -1,0 +1,60 @@
+"""What ``verify`` proves, beside the learned robot's own verdict, of the analytical model that it was learned from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from sagemp_cli.config.binding import options_for
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.progress import Progress
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.sets.partition import parse_partitions, uncertain_dimensions
+from sagemp_cli.storage import TrueModel
+from sagemp_cli.verification.deviation import Folded, split
+
+
+@dataclass(frozen=True)
+class TrueModelProof:
+    """A proof with the learned robot's deviation folded into w.
+
+    Attributes:
+        proof: of the same problem, with a propagator that folds and cells of its own.
+    """
+
+    proof: Proof
+
+    @classmethod
+    def of(cls, section: Any, proof: Proof) -> TrueModelProof:
+        """From the section ``verify.true_model`` and the proof of the learned robot itself.
+
+        Raises:
+            ConfigError: an option or a partition that is not one.
+        """
+        counts = proof.counts
+        options: Mapping[str, Any] = options_for(_options, section, "verify.true_model")
+        if options.get("partitions") is not None:
+            try:
+                uncertain = len(uncertain_dimensions(proof.problem.start))
+                counts = parse_partitions(options["partitions"], uncertain, auto=True)
+            except ConfigError as e:
+                raise ConfigError(f"verify.true_model.{e}") from None
+        affine = proof.propagator if isinstance(proof.propagator, Affine) else Affine()
+        return cls(dataclasses.replace(proof, propagator=Folded(affine), counts=counts))
+
+    def verify(self, references: Tensor, tracker: Tracker, progress: Progress) -> TrueModel:
+        """Tubes and verdicts of references ``(R, K+1, n)``, and how much was folded."""
+        found = self.proof.verify(references, tracker, progress=progress)
+        plain, deviation = split(found, self.proof.problem.dynamics.control_dim)
+        return TrueModel(tubes=tubes_record(plain), deviation=deviation.numpy())
+
+
+def _options(*, partitions: Any = None) -> None:
+    """The options of the section: cells as ``verify.partitions`` has them, which is also the default."""

@@ -1,0 +1,101 @@
+"""Verifications to the record that certificates and libraries store, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.storage import Relaxations, Tubes
+from sagemp_cli.verification.verdict import Outcome, Verdict
+from sagemp_cli.verification.verification import Verification
+
+
+def tubes_record(v: Verification) -> Tubes:
+    """A verification as stored."""
+    return Tubes(
+        references=v.references.numpy(),
+        start_lower=v.start.lower.numpy(),
+        start_upper=v.start.upper.numpy(),
+        disturbance_lower=v.disturbance.lower.numpy(),
+        disturbance_upper=v.disturbance.upper.numpy(),
+        cell_reference=v.cell_reference.numpy(),
+        cell_lower=v.cells.lower.numpy(),
+        cell_upper=v.cells.upper.numpy(),
+        tube_lower=v.tube.lower.numpy(),
+        tube_upper=v.tube.upper.numpy(),
+        control_lower=v.control_lower.numpy(),
+        control_upper=v.control_upper.numpy(),
+        verdict=tuple(str(x.outcome) for x in v.verdicts),
+        step=np.array([x.step for x in v.verdicts], dtype=np.int64),
+        constraint=tuple(x.constraint for x in v.verdicts),
+        constraint_names=v.constraint_names,
+        clearance=v.clearance.numpy(),
+        goal_margin=v.goal_margin.numpy(),
+        seconds=v.seconds.numpy(),
+        propagator=v.propagator,
+        rigorous=v.rigorous,
+        relaxations=None if v.recording is None else _relaxations(v.recording),
+    )
+
+
+def _relaxations(recording: Recording) -> Relaxations:
+    return Relaxations(
+        operations=recording.operations,
+        widths=np.array(recording.widths, dtype=np.int64),
+        slope=recording.slope.numpy(),
+        offset=recording.offset.numpy(),
+        radius=recording.radius.numpy(),
+        kept=None if recording.kept is None else recording.kept.numpy(),
+    )
+
+
+def _recording(record: Relaxations) -> Recording:
+    return Recording(
+        record.operations,
+        tuple(record.widths.tolist()),
+        torch.from_numpy(record.slope),
+        torch.from_numpy(record.offset),
+        torch.from_numpy(record.radius),
+        None if record.kept is None else torch.from_numpy(record.kept),
+    )
+
+
+def verification_of(record: Tubes, where: str) -> Verification:
+    """A stored record as a verification; ``where`` names the file in messages.
+
+    Raises:
+        ArtifactError: the cells are not sorted by reference, a reference has none, or a verdict is unknown.
+    """
+    count, owner = len(record.references), record.cell_reference
+    if count == 0 or (np.diff(owner) < 0).any() or not np.array_equal(np.unique(owner), np.arange(count)):
+        raise ArtifactError(
+            f"{where}: /data/tubes/cell_reference must list the cells of each of {count} references in turn"
+        )
+    unknown = [x for x in record.verdict if x not in list(Outcome)]
+    if unknown:
+        raise ArtifactError(f"{where}: /data/tubes/verdict holds '{unknown[0]}'; known: {', '.join(Outcome)}")
+
+    return Verification(
+        references=torch.from_numpy(record.references),
+        start=Box(torch.from_numpy(record.start_lower), torch.from_numpy(record.start_upper)),
+        disturbance=Box(torch.from_numpy(record.disturbance_lower), torch.from_numpy(record.disturbance_upper)),
+        cell_reference=torch.from_numpy(owner),
+        cells=Box(torch.from_numpy(record.cell_lower), torch.from_numpy(record.cell_upper)),
+        tube=Tube(torch.from_numpy(record.tube_lower), torch.from_numpy(record.tube_upper)),
+        control_lower=torch.from_numpy(record.control_lower),
+        control_upper=torch.from_numpy(record.control_upper),
+        verdicts=tuple(
+            Verdict(Outcome(o), int(k), c)
+            for o, k, c in zip(record.verdict, record.step, record.constraint, strict=True)
+        ),
+        constraint_names=record.constraint_names,
+        clearance=torch.from_numpy(record.clearance),
+        goal_margin=torch.from_numpy(record.goal_margin),
+        seconds=torch.from_numpy(record.seconds),
+        propagator=record.propagator,
+        rigorous=bool(record.rigorous),
+        recording=None if record.relaxations is None else _recording(record.relaxations),
+    )

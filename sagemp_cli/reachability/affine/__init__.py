@@ -1,0 +1,1 @@
+"""Forward affine arithmetic, the default propagator."""

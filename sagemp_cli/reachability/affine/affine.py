@@ -1,0 +1,180 @@
+"""Forward affine arithmetic: the default propagator.
+
+The set of states at step k is a zonotope ``c_k + G_k [-1, 1]^M``. Each step is evaluated once on affine forms
+(:mod:`sagemp_cli.reachability.affine.form`), which gives the affine inclusion ::
+
+    x_{k+1} in c + J_x (x_k - c_k) + J_w (w_k - c_w) + L [-1, 1]^l + [-e, e]
+
+and with it ``G_{k+1} = [J_x G_k, J_w diag(r_w), L, diag(e)]``. Every error keeps its correlation, which the
+feedback then contracts, until it is negligible (:mod:`sagemp_cli.sets.order_reduction`). Rounding is included (last
+block), so the tube encloses every real-arithmetic rollout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+import sagemp_cli.reachability.affine.operations  # noqa: F401  (gives the forms their operations)
+import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the relaxations)
+from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
+from sagemp_cli.reachability.affine.compiled.run import planned_run
+from sagemp_cli.reachability.affine.form import AffineForm, Hints, StepFrame
+from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.order_reduction import reduce_generators
+from sagemp_cli.sets.rounding import UNIT
+
+
+@dataclass(frozen=True)
+class AffineRun:
+    """All that a forward pass found.
+
+    Attributes:
+        tube: bounds per step, ``(*batch, K+1, n)``.
+        bands: per step, the bands used, in the order of evaluation.
+        kept: per step, the mask of the generators kept, ``(M,)`` or ``(*batch, M)``.
+        steps: per step, the form of the next state (and in its frame, what went into it); empty unless asked for.
+        controls: per step, bounds of the controls; empty unless asked for.
+    """
+
+    tube: Tube
+    bands: list[list[tuple[str, Band]]] = field(repr=False)
+    kept: list[Tensor] = field(default_factory=list, repr=False)
+    steps: list[AffineForm] = field(default_factory=list, repr=False)
+    controls: list[tuple[Tensor, Tensor]] = field(default_factory=list, repr=False)
+
+    def recording(self) -> Recording:
+        """What a certificate keeps of the run."""
+        return Recording.of(self.bands, self.tube.lower.shape[:-2], self.kept)
+
+
+@dataclass(frozen=True)
+class Affine:
+    """Forward affine arithmetic, rigorous.
+
+    Attributes:
+        symbols: most generators kept between steps (None: all that are not negligible); the others are boxed, soundly.
+    """
+
+    symbols: int | None = None
+    name: str = "affine"
+    rigorous: bool = True
+
+    def __post_init__(self) -> None:
+        if self.symbols is not None and self.symbols < 1:
+            raise ConfigError(f"propagator.symbols must be a positive integer or null, found {self.symbols}")
+
+    @torch.no_grad()
+    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
+        return self._fast_run(loop, start, disturbance).tube
+
+    @torch.no_grad()
+    def propagate_with_controls(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor]:
+        """The tube and, per step, bounds of the controls ``(*batch, K, m)`` over it, from the same pass."""
+        return self.prove(loop, start, disturbance)[:3]
+
+    @torch.no_grad()
+    def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
+        """As :meth:`propagate_with_controls`, with what a certificate keeps of the proof."""
+        run = self._fast_run(loop, start, disturbance, watch=True)
+        lower, upper = (torch.stack(side, dim=-2) for side in zip(*run.controls, strict=True))
+        bad = torch.isnan(lower) | torch.isnan(upper)
+        return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
+
+    def _fast_run(self, loop: Loop, start: Box, disturbance: Box, watch: bool = False) -> AffineRun:
+        """:meth:`run` without autograd's bookkeeping; the tube is of ordinary tensors."""
+        with torch.inference_mode():
+            run = self.run(loop, start, disturbance, watch=watch)
+        return dataclasses.replace(run, tube=Tube(run.tube.lower.clone(), run.tube.upper.clone()))
+
+    def run(
+        self,
+        loop: Loop,
+        start: Box,
+        disturbance: Box,
+        *,
+        horizon: int | None = None,
+        keep_steps: bool = False,
+        hints: Sequence[Hints] | None = None,
+        watch: bool = False,
+    ) -> AffineRun:
+        """Propagate and keep the bands (differentiable where autograd is on).
+
+        A loop that can be folded is, where autograd is off: see :mod:`sagemp_cli.reachability.affine.compiled.run`.
+
+        Args:
+            loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
+            horizon: steps; the loop's by default.
+            keep_steps: keep every step's form, for a backward pass.
+            hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
+            watch: bound what the loop's ``step_given`` gives beside the next state, usually the controls.
+        """
+        steps = loop.horizon if horizon is None else horizon
+        foldable = isinstance(loop, FoldableLoop) and speaks_for_itself(loop)
+        if watch and not foldable:
+            raise UsageError(f"{type(loop).__name__} has a step of its own, which does not say what its controls are")
+        if foldable and not torch.is_grad_enabled():
+            wanted = {"symbols": self.symbols, "hints": hints, "keep_steps": keep_steps, "watch": watch}
+            with contextlib.suppress(NotFoldable):
+                found = planned_run(loop, start, disturbance, steps, **wanted)
+                return AffineRun(found.tube, found.bands, found.kept, found.steps, found.controls)
+        center, reach = start.center, start.radius
+        generators = torch.diag_embed(reach)
+        lowers, uppers = [start.lower], [start.upper]
+        w_center, w_radius = disturbance.center, disturbance.radius
+        bands, masks, kept_steps, controls = [], [], [], []
+        for k in range(steps):
+            frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
+            x, w = frame.state(center), frame.disturbance(w_center)
+            if watch:
+                after, watched = loop.step_given(loop.given(k), x, w)
+                controls.append(watched.bounds())
+            else:
+                after = loop.step(k, x, w)
+            bands.append(frame.bands)
+            center, generators = _advance(after)
+            if keep_steps:
+                frame.condense()
+                kept_steps.append(after)
+            generators, mask = reduce_generators(generators, self.symbols)
+            masks.append(mask)
+            growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
+            reach = generators.abs().sum(-1) * growth
+            spread = reach * (1.0 + 2 * UNIT) + center.abs() * (2 * UNIT)
+            lowers.append(center - spread)
+            uppers.append(center + spread)
+            if not bool(torch.isfinite(reach).all()):
+                lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
+        tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
+        return AffineRun(tube, bands, masks, kept_steps, controls)
+
+
+def _advance(after: AffineForm) -> tuple[Tensor, Tensor]:
+    """Centre and generators of the next state set from the step's affine form."""
+    return after.center, torch.cat([after.spread(), torch.diag_embed(after.rounding())], dim=-1)
+
+
+def _overflow(lowers, uppers, center, generators, reach):
+    """Give cells that overflowed infinite bounds from here on, and NaN to go on with; other cells are not disturbed."""
+    bad = ~torch.isfinite(reach).all(-1, keepdim=True)
+    lowers[-1] = torch.where(bad, torch.full_like(lowers[-1], -math.inf), lowers[-1])
+    uppers[-1] = torch.where(bad, torch.full_like(uppers[-1], math.inf), uppers[-1])
+    return (
+        lowers,
+        uppers,
+        torch.where(bad, torch.full_like(center, math.nan), center),
+        torch.where(bad[..., None], torch.full_like(generators, math.nan), generators),
+        torch.where(bad, torch.full_like(reach, math.nan), reach),
+    )

@@ -1,0 +1,1 @@
+"""Affine arithmetic of loops whose steps are alike, on arrays."""

@@ -1,0 +1,1 @@
+"""Backward linear bounds (CROWN), and the best of both directions."""

@@ -1,0 +1,257 @@
+"""The backward pass of CROWN over the steps that a forward pass recorded.
+
+A linear functional (a *row*) of the next state is a functional of the step's variables
+(:mod:`.crown.backward_steps`). Backwards, in the reverse order of evaluation, each error ``e_j`` is
+replaced by a line over x_j, the upper or the lower one according to the sign of its coefficient; and x_j is a function
+of earlier variables. What remains at the end of the step is a functional of the state's deviations ``z``, which is a
+row of the previous state. With both lines parallel to the band this is affine arithmetic again; lines chosen by sign
+are what CROWN has more.
+
+Everything that does not depend on the rows is done once for all steps: a replacement is one product of a fixed matrix
+with the coefficients' positive and negative parts. Rows are the columns of arrays here, so that a variable's
+coefficients lie side by side.
+
+Rounding. Each matrix has a row more, with the magnitudes ``|coefficients| |v|`` that pass through it. Their sum T
+bounds every intermediate result, so a step errs by at most ``gamma T`` (Higham 2002, section 3.1; gamma from the
+lengths of all sums), and that is added to the bound. The computed coefficients are taken as they are: what they differ
+from the exact ones by is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.crown.backward_steps import LEAD, Array, Inputs, Product, Replacement, Step
+from sagemp_cli.sets.rounding import TINY, UNIT
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a backward pass found.
+
+    Attributes:
+        state: ``(lower, upper)`` of the deviations of the states from their centres per target step,
+            ``(*batch, targets, n)``.
+        inputs: the same of each operation's input, per target step and operation, ``(*batch, E)``; infinite
+            for entries, and None for operations, that were not asked for.
+    """
+
+    state: tuple[Tensor, Tensor]
+    inputs: list[list[tuple[Tensor, Tensor] | None]]
+
+    def intersected(self, other: Bounds) -> Bounds:
+        """What holds if both hold."""
+
+        def both(a: Any, b: Any) -> Any:
+            return None if a is None or b is None else (torch.maximum(a[0], b[0]), torch.minimum(a[1], b[1]))
+
+        inputs = [
+            [both(a, b) for a, b in zip(*step, strict=True)] for step in zip(self.inputs, other.inputs, strict=True)
+        ]
+        return Bounds(both(self.state, other.state), inputs)
+
+
+@np.errstate(all="ignore")  # what overflows is unbounded
+def backward(steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False) -> Bounds:
+    """Bounds of the states after the target steps (and of all operations' inputs in these steps) over the start box.
+
+    Two sweeps, one with tilted and one with level planes over products; neither is always the better one.
+
+    Args:
+        steps: from :func:`compiled`, step 0 first.
+        radius: of the start box, ``(*batch, n)``.
+        targets: the steps whose results are bounded.
+        inputs: whether the operations' inputs are bounded too.
+    """
+    level = _swept(steps, radius, targets, inputs, False)
+    if all(r.product is None for step in steps for r in step.replacements):
+        return level
+    return level.intersected(_swept(steps, radius, targets, inputs, True))
+
+
+def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, tilted: bool) -> Bounds:
+    """All targets go back in one sweep; a target joins when the sweep comes by."""
+    n = radius.shape[-1]
+    sweep = _Sweep(steps, radius.reshape(-1, n).numpy(), targets, inputs)
+    joined: list[tuple[int, Inputs | None, int]] = []  # step, inputs (None: the state), rows
+    for k in range(targets.stop - 1, -1, -1):
+        step = steps[k]
+        if k in targets:
+            joined.append((k, None, sweep.join_states()))
+        sweep.enter(step)
+        for r in reversed(step.replacements):
+            if r.lines is not None:
+                sweep.add(r.lines, sweep.scaled(r))
+            elif tilted and r.product is not None:
+                _tilt(sweep.head(r.first), sweep.scaled(r), r.product, step.shape, step.own)
+            else:
+                sweep.keep(r)
+            if inputs and k in targets and r.inputs is not None:
+                joined.append((k, r.inputs, sweep.join(r.inputs)))
+        sweep.leave(step.rounding)
+    return _collected(sweep.upper(), joined, targets, steps, radius.shape[:-1])
+
+
+class _Sweep:
+    """The rows on their way, as columns of arrays that are made once.
+
+    Args:
+        steps, targets, inputs: as for :func:`backward`.
+        radius: of the start box, ``(B, n)``.
+    """
+
+    def __init__(self, steps: Sequence[Step], radius: Array, targets: range, inputs: bool) -> None:
+        cells, n = radius.shape
+        most = 2 * n * len(targets)
+        if inputs:
+            most += sum(r.inputs.rows.shape[-1] for k in targets for r in steps[k].replacements if r.inputs)
+        passed = steps[: targets.stop]
+        width = max(step.output.shape[-2] for step in passed)
+        widest = max(r.last - r.first for step in passed for r in step.replacements)
+        self._radius, self._count = radius[:, None], 0
+        self._constant, self._states = np.empty((cells, most)), np.empty((cells, n, most))
+        self._values, self._scratch = np.empty((2, cells, width, most))
+        self._parts = np.empty((cells, 2 * max(n, widest), most))
+
+    def join_states(self) -> int:
+        """Rows of the state itself, and of minus it; how many."""
+        n = self._states.shape[-2]
+        here = slice(self._count, self._count + 2 * n)
+        self._constant[:, here] = 0.0
+        self._states[..., here] = np.concatenate([np.eye(n), -np.eye(n)], axis=-1)
+        self._count += 2 * n
+        return 2 * n
+
+    def enter(self, step: Step) -> None:
+        """Rows of the next state as rows of the step's variables."""
+        parts = self._split(self._states[..., : self._count])
+        np.matmul(step.output, parts, out=self._values[:, : step.output.shape[-2], : self._count])
+
+    def head(self, first: int) -> Array:
+        """Gain, magnitude, and the coefficients of the first variables; may be changed."""
+        return self._values[:, : LEAD + first, : self._count]
+
+    def scaled(self, r: Replacement) -> Array:
+        """Positive and negative parts of a replacement's coefficients, in units of the errors themselves."""
+        return self._split(self._values[:, LEAD + r.first : LEAD + r.last, : self._count] * r.inverse)
+
+    def add(self, lines: Array, parts: Array) -> None:
+        """What lines make of them."""
+        made = np.matmul(lines, parts, out=self._scratch[:, : lines.shape[-2], : self._count])
+        head = self._values[:, : lines.shape[-2], : self._count]
+        np.add(head, made, out=head)
+
+    def keep(self, r: Replacement) -> None:
+        """Variables of which only their radius is used."""
+        size = np.abs(self._values[:, LEAD + r.first : LEAD + r.last, : self._count])
+        self._values[:, :LEAD, : self._count] += r.radius @ size
+
+    def join(self, inputs: Inputs) -> int:
+        """Rows of an operation's inputs; how many."""
+        height, count = inputs.rows.shape[-2:]
+        here = slice(self._count, self._count + count)
+        self._constant[:, here] = 0.0
+        self._values[:, :height, here] = inputs.rows
+        self._count += count
+        return count
+
+    def leave(self, rounding: float) -> None:
+        """Rows of the step's variables, all but the state's replaced, as rows of the state."""
+        n, lead = self._states.shape[-2], self._values[:, :LEAD, : self._count]
+        gain = lead[:, 0] + (rounding * lead[:, 1] + TINY)
+        constant = self._constant[:, : self._count]
+        constant += gain
+        constant += (np.abs(constant) + np.abs(gain)) * (4 * UNIT)
+        self._states[..., : self._count] = self._values[:, LEAD : LEAD + n, : self._count]
+
+    def upper(self) -> Array:
+        """Upper bounds of all rows over the start box, ``(B, rows)``; infinite where there are none."""
+        n = self._states.shape[-2]
+        reach = (self._radius @ np.abs(self._states))[:, 0]
+        upper = self._constant + reach * (1.0 + (2 * n + 8) * UNIT)
+        upper += (np.abs(upper) + reach) * (4 * UNIT)
+        return np.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=math.inf)
+
+    def _split(self, rows: Array) -> Array:
+        """Positive and negative parts one after the other, both not negative; valid until the next call."""
+        return _split(rows, self._parts[:, : 2 * rows.shape[-2], : self._count])
+
+
+def _split(rows: Array, out: Array) -> Array:
+    """Positive and negative parts one after the other, both not negative."""
+    entries = rows.shape[-2]
+    np.maximum(rows, 0.0, out=out[:, :entries])
+    np.subtract(out[:, :entries], rows, out=out[:, entries:])
+    return out
+
+
+def _tilt(head: Array, parts: Array, product: Product, shape: Array, own: Array) -> None:
+    """Replace the error of a product ``X Y`` by a plane, tilted so that it is low where the row is large.
+
+    ``X Y = (P^2 - M^2) / 4`` with ``|P| <= p``, ``|M| <= m`` and ``|P| + |M| <= 2 s``. For every tilt ``|a| <= s`` the
+    excess over ``a M`` is at most ``p^2 / 4 + a^2`` if ``2 |a| <= q = min(m, 2 s - p)``, and
+    ``p^2 / 4 - q^2 / 4 + |a| q`` otherwise: ``P^2`` is at its largest for ``|M| <= 2 s - p``, and beyond that the
+    boundary ``|P| = 2 s - |M|`` makes the excess linear, falling outwards. For independent factors (p = m = 2 s) and
+    ``a = +-s`` these are McCormick's planes, for ``a = 0`` the band of affine arithmetic. Below it is the same with P
+    and M exchanged.
+
+    Where the row is large is a guess, the state set being taken for an ellipsoid.
+
+    Args:
+        head: gain, magnitude, and coefficients of the variables before; changed.
+        parts: of the coefficients, upper bounds' first.
+        product, shape, own: of the step.
+    """
+    n = shape.shape[-1]
+    rows = head[:, LEAD:]
+    state = rows[:, :n]
+    star = product.likely @ state
+    star /= np.sqrt(np.add.reduce((shape @ state) * state, axis=-2, keepdims=True)) + TINY
+    star += product.tilts[..., n:] @ (np.sign(rows[:, n:]) * own[: rows.shape[-2] - n])
+    star = np.nan_to_num(star, copy=False)
+    steep = np.abs(star)
+    inside = steep <= product.free
+    steep = np.where(inside, 0.5 * steep, product.size)
+    cost = np.where(2 * steep <= product.free, steep * steep, (steep - 0.25 * product.free) * product.free)
+    cost += product.top
+    cost *= parts * (1.0 + 16 * UNIT)
+    size = parts * steep
+    head[:, 0] += np.add.reduce(cost + parts * product.offset + size * product.rounding, axis=-2)
+    head[:, 1] += np.add.reduce(cost + parts * product.middle + size * product.magnitude, axis=-2)
+    rows += product.tilts.mT @ np.copysign(size, -star)
+
+
+def _collected(
+    upper: Array,
+    joined: Sequence[tuple[int, Inputs | None, int]],
+    targets: range,
+    steps: Sequence[Step],
+    batch: torch.Size,
+) -> Bounds:
+    """Upper bounds of rows and of minus the rows, as lower and upper bounds by step and operation."""
+    states: list[Any] = [None] * len(targets)
+    found: list[list[Any]] = [[None] * len(steps[k].entries) for k in targets]
+    begin = 0
+    for k, inputs, count in joined:
+        high, low = np.split(upper[:, begin : begin + count], 2, axis=-1)
+        begin += count
+        if inputs is None:
+            states[k - targets.start] = (-low, high)
+            continue
+        lower = np.full((len(upper), steps[k].entries[inputs.operations[0]]), -math.inf)
+        higher = -lower
+        lower[:, inputs.entries], higher[:, inputs.entries] = -low, high
+        bounds = tuple(torch.from_numpy(side).reshape(*batch, -1) for side in (lower, higher))
+        for operation in inputs.operations:
+            found[k - targets.start][operation] = bounds
+    lower, higher = (
+        torch.from_numpy(np.stack(side, axis=1)).reshape(*batch, len(targets), -1) for side in zip(*states, strict=True)
+    )
+    return Bounds((lower, higher), found)

@@ -1,0 +1,396 @@
+"""The steps that a forward pass recorded, made ready for a backward pass over them.
+
+The forward pass writes the inputs of every nonlinear operation, and the next state, as ``center + coefficients @ v``
+where the variables v are the deviations ``z`` of state and disturbance and one error
+``e_j = y_j - (slope x_j + offset)`` per relaxed entry ``y_j = f(x_j)``, scaled to [-1, 1]. The backward pass
+(:mod:`.crown.backward`) takes a linear functional (a *row*) of the next state, which is one of v, and
+replaces each ``e_j`` by a line over x_j. All that this needs and that does not depend on the rows is found here, for
+all steps of equal structure at once, with torch; what comes out are arrays, because the sweep works on arrays in place.
+
+Errors of entries that are linear on their interval (most neurons, at most steps) are rounding only. They are no
+variables here: wherever they come in, the sum of their coefficients' absolute values is added to the gain instead.
+
+Layout. Every matrix maps the positive and negative parts of entries, side by side as columns, to a block of rows: the
+gain, the magnitude, and the coefficients of the variables before. Cells come first.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.affine.form import SAFETY, AffineForm, Relaxed
+from sagemp_cli.sets.rounding import TINY, UNIT
+
+Array = np.ndarray
+
+LINEAR = 1e-9
+"""A band this narrow, relative to the values, is rounding only."""
+
+LEAD = 2
+"""Rows before the coefficients: what is gained, and the magnitude."""
+
+
+class Product(NamedTuple):
+    """Planes over a product's factors, see :func:`~.crown.backward._tilted`. Upper bounds first, then
+    lower ones, ``(B, 2E, 1)``.
+
+    Attributes:
+        tilts: what a plane may be tilted along, the difference M and the sum P, as coefficients ``(B, 2E, first)``.
+        likely: the same of the state, times the ellipsoid that stands for the state set where a guess is enough,
+            ``(B, 2E, n)``.
+        top: the plane's height when it is not tilted.
+        free: the tilts up to ``free / 2`` cost only their square.
+        size: the largest tilt.
+        offset: from the product to its error as the forward pass counts it, rounding included.
+        middle: size of that without rounding.
+        magnitude, rounding: of the tilting variable, and what of it is rounding error.
+    """
+
+    tilts: Array
+    likely: Array
+    top: Array
+    free: Array
+    size: Array
+    offset: Array
+    middle: Array
+    magnitude: Array
+    rounding: Array
+
+
+class Inputs(NamedTuple):
+    """Inputs of operations, to be bounded.
+
+    Attributes:
+        rows: of the inputs and of minus them, ``(B, 2 + first, 2C)``.
+        operations: whose they are.
+        entries: which of their entries, C numbers: those where the function is not linear on the interval; nothing is
+            gained by bounding the others once more.
+    """
+
+    rows: Array
+    operations: tuple[int, ...]
+    entries: Array
+
+
+class Replacement(NamedTuple):
+    """How the error variables of one operation are replaced.
+
+    Attributes:
+        first, last: the rows of its variables, without the lead.
+        radius: of variables that are known only to lie in ``[-radius, radius]``, ``(B, 1, E)``; of a product's, if its
+            planes are level.
+        inverse: of variables with lines or planes, one over their scale, ``(B, E, 1)``.
+        lines: of these, ``(B, 2 + first, 2E)``.
+        product: planes instead of lines.
+        inputs: the operation's, where they are not found with another's.
+    """
+
+    first: int
+    last: int
+    radius: Array | None = None
+    inverse: Array | None = None
+    lines: Array | None = None
+    product: Product | None = None
+    inputs: Inputs | None = None
+
+
+class Step(NamedTuple):
+    """One step, ready for rows.
+
+    Attributes:
+        output: the next state's deviation from its centre in terms of all variables, ``(B, 2 + variables, 2n)``.
+        replacements: in the order of evaluation; the disturbance is the first.
+        shape: the ellipsoid that stands for the state set where a guess is enough, ``(B, n, n)``.
+        own: radii of the other variables, ``(variables - n, 1)``.
+        rounding: relative rounding error of the step's sums.
+        entries: of each operation, ``(E,)`` of all.
+    """
+
+    output: Array
+    replacements: tuple[Replacement, ...]
+    shape: Array
+    own: Array
+    rounding: float
+    entries: tuple[int, ...]
+
+
+def compiled(steps: Sequence[AffineForm]) -> list[Step]:
+    """The recorded steps, ready for rows; equal structures are stacked, so that lines are found in one call for all."""
+    parts: list[Step] = []
+    for _, group in itertools.groupby(steps, key=_structure):
+        parts += _compile(list(group))
+    return parts
+
+
+def _structure(after: AffineForm) -> Any:
+    """Equal for steps that can be stacked."""
+
+    def known(parameter: Any) -> Any:
+        return ("tensor", id(parameter)) if isinstance(parameter, Tensor) else parameter
+
+    return (
+        after.coefficients.shape,
+        tuple(
+            (r.name, r.first, r.coefficients.shape, r.error, r.operation, tuple(map(known, r.parameters)))
+            for r in after.frame.relaxations
+        ),
+    )
+
+
+class _Stacked(NamedTuple):
+    """One operation in all steps, as tensors ``(steps, B, ...)``.
+
+    Attributes:
+        first, last: its variables.
+        kept: which of them are variables of the backward pass, ``(steps, E)``; None: all.
+        radius, inverse: as for :class:`Replacement`, ``(..., E)``.
+        lines: from positive and negative parts to gain, magnitude and earlier coefficients, ``(..., 2E, 2 + first)``.
+        input: the operation's input, and minus it, as such rows.
+        tilts, planes: of a product, as for :class:`Product`; planes are ``(..., 2E)`` by name.
+    """
+
+    first: int
+    last: int
+    kept: Tensor | None = None
+    radius: Tensor | None = None
+    inverse: Tensor | None = None
+    lines: Tensor | None = None
+    input: Tensor | None = None
+    tilts: Tensor | None = None
+    planes: dict[str, Tensor] | None = None
+
+
+def _compile(steps: list[AffineForm]) -> Iterator[Step]:
+    """Steps of one structure."""
+    frame, count = steps[0].frame, len(steps)
+    n, cells = frame.states, math.prod(frame.batch)
+    radius = torch.stack([s.frame.disturbance_radius for s in steps])[:, None]
+    stacked = [_Stacked(n, frame.inputs, radius=radius)]
+    stacked += [_operation(list(group), cells) for group in zip(*(s.frame.relaxations for s in steps), strict=True)]
+    carried = torch.stack([s.rounding() for s in steps]).reshape(count, cells, n)
+    output = _signed(carried, _stack(steps, "magnitude", cells), _rows(steps, cells))
+    # Every product of a step is a sum of twice its entries, and what is no variable adds as many; 8 more for the
+    # factors and for joining it to the rest.
+    lengths = [4 * n + 8, *(4 * (s.last - s.first) + 8 for s in stacked)]
+    shape = torch.stack([s.frame.ellipsoid for s in steps]).reshape(count, cells, n, n)
+    kept = torch.ones(count, frame.size, dtype=torch.bool)
+    for s in stacked:
+        if s.kept is not None:
+            kept[:, s.first : s.last] = s.kept
+    own = frame.own_radius(frame.size - n).numpy()[:, None]
+    variables = _Variables(kept)
+    outputs = variables.condensed(output)
+    shared = [_equal_inputs(*pair) for pair in itertools.pairwise(stacked)]
+    parts = [
+        _Part(s, variables, shape, found_before=before, found_after=after)
+        for s, before, after in zip(stacked, [None, *shared], [*shared, None], strict=True)
+    ]
+    shapes = shape.numpy()
+    for k in range(count):
+        yield Step(
+            outputs[k][:, variables.rows[k]],
+            tuple(found for i, part in enumerate(parts) if (found := part.at(k, i - 1)) is not None),
+            shapes[k],
+            own[variables.index[k][n:] - n],
+            sum(lengths) * UNIT * SAFETY,
+            tuple(s.last - s.first for s in stacked[1:]),
+        )
+
+
+class _Variables:
+    """Which variables the steps have.
+
+    Attributes:
+        kept: of all, ``(steps, variables)``.
+        index: per step, their numbers among all.
+        rows: the same of rows with a lead.
+        before: how many of them come before each one of all, and how many there are, ``variables + 1`` numbers a step.
+    """
+
+    def __init__(self, kept: Tensor) -> None:
+        self.kept = kept
+        self.index = [np.flatnonzero(row) for row in kept.numpy()]
+        self.rows = [np.concatenate([np.arange(LEAD), row + LEAD]) for row in self.index]
+        self.before = torch.nn.functional.pad(kept.cumsum(-1), (1, 0)).tolist()
+
+    def condensed(self, rows: Tensor) -> Array:
+        """Rows ``(..., 2 + first)``, with what they have of no variables in their lead, as columns."""
+        gone = self.gone(rows[..., LEAD:])[..., None]
+        return torch.cat([rows[..., :LEAD] + gone, rows[..., LEAD:]], dim=-1).mT.contiguous().numpy()
+
+    def gone(self, coefficients: Tensor) -> Tensor:
+        """Bound of what coefficients ``(steps, B, rows, first)`` have of no variables, ``(steps, B, rows)``."""
+        first = coefficients.shape[-1]
+        some = torch.where(self.kept[:, None, None, :first], 0.0, coefficients.abs())
+        return some.sum(-1) * (1.0 + 2 * (first + 4) * UNIT)
+
+
+class _Part:
+    """One operation in all steps, as arrays.
+
+    Args:
+        stacked: as tensors.
+        variables: of the steps.
+        shape: as for :class:`Step`, of all.
+        found_before, found_after: at which steps its input is bounded with that of the operation before or after.
+    """
+
+    def __init__(
+        self,
+        stacked: _Stacked,
+        variables: _Variables,
+        shape: Tensor,
+        *,
+        found_before: Array | None,
+        found_after: Array | None,
+    ) -> None:
+        self._stacked, self._variables = stacked, variables
+        self._before, self._after = found_before, found_after
+        self._radius = None if stacked.radius is None else stacked.radius[..., None, :].numpy()
+        self._inverse = None if stacked.inverse is None else stacked.inverse[..., None].numpy()
+        self._lines = None if stacked.lines is None else variables.condensed(stacked.lines)
+        self._input = None if stacked.input is None else variables.condensed(stacked.input)
+        if stacked.tilts is not None and stacked.planes is not None:
+            gone = variables.gone(stacked.tilts)
+            planes = {name: part + gone if name in _OF_TILTS else part for name, part in stacked.planes.items()}
+            self._planes = {name: part[..., None].numpy() for name, part in planes.items()}
+            self._tilts = stacked.tilts.numpy()
+            self._likely = (stacked.tilts[..., : shape.shape[-1]] @ shape).numpy()
+
+    def at(self, k: int, operation: int) -> Replacement | None:
+        """The operation, of that number, at step k; None if it has no variables there."""
+        s, before, rows = self._stacked, self._variables.before[k], self._variables.rows[k]
+        first, last = before[s.first], before[s.last]
+        if first == last:
+            return None
+        if s.kept is None:
+            radius = None if self._radius is None else self._radius[k]
+            if s.tilts is None or self._inverse is None:
+                return Replacement(first, last, radius)
+            tilts = self._tilts[k][..., self._variables.index[k][:first]]
+            planes = {name: part[k] for name, part in self._planes.items()}
+            return Replacement(first, last, radius, self._inverse[k], product=Product(tilts, self._likely[k], **planes))
+        assert self._lines is not None and self._inverse is not None and self._input is not None
+        entries = np.flatnonzero(s.kept[k].numpy())
+        part = (slice(None), *np.ix_(rows[: LEAD + first], np.concatenate([entries, entries + (s.last - s.first)])))
+        inputs = None
+        if self._before is None or not self._before[k]:
+            both = self._after is not None and self._after[k]
+            inputs = Inputs(self._input[k][part], (operation, operation + 1) if both else (operation,), entries)
+        return Replacement(first, last, None, self._inverse[k][:, entries], self._lines[k][part], inputs=inputs)
+
+
+_OF_TILTS = ("magnitude", "rounding")
+
+
+def _equal_inputs(a: _Stacked, b: _Stacked) -> Array | None:
+    """At which steps two operations that follow one another have the same input, not linear in the same entries."""
+    if a.input is None or b.input is None or a.kept is None or b.kept is None or a.kept.shape != b.kept.shape:
+        return None
+    width = a.input.shape[-1]
+    if not torch.equal(a.input, b.input[..., :width]) or bool(b.input[..., width:].any()):
+        return None
+    return (a.kept == b.kept).all(-1).numpy()
+
+
+def _operation(group: list[Relaxed], cells: int) -> _Stacked:
+    """One operation in all steps."""
+    r = group[0]
+    magnitude, radius = _stack(group, "magnitude", cells), _stack(group, "radius", cells)
+    last = r.first + radius.shape[-1]
+    if r.operation is None:
+        kept = _Stacked(r.first, last, radius=torch.ones_like(radius))
+        if r.factors is None:
+            return kept
+        tilts, planes = _planes(group, cells, magnitude)
+        return kept._replace(inverse=1.0 / radius, tilts=tilts, planes=planes)
+    error, coefficients = r.error, _rows(group, cells)
+    missing = r.first - coefficients.shape[-1]
+    coefficients = torch.nn.functional.pad(coefficients, (0, missing))
+    center = _stack(group, "center", cells)
+    slope, offset, _ = (
+        torch.stack([q.band[part].expand(q.radius.shape) for q in group]).reshape(radius.shape) for part in range(3)
+    )
+    below, low, above, high = _lines(group, radius.shape)
+    # The band's error as a function of x: what the input's own rounding does to it is in the last term.
+    own = (slope.abs() * magnitude + offset.abs() + radius) * ((error + 8 * UNIT) * SAFETY)
+
+    def relative(line_slope: Tensor, line_offset: Tensor, sign: float) -> tuple[Tensor, Tensor]:
+        tilt = line_slope - slope
+        value = tilt * center + (line_offset - offset)
+        doubt = tilt.abs() * magnitude * ((error + 8 * UNIT) * SAFETY)
+        doubt = doubt + (line_offset.abs() + offset.abs()) * (8 * UNIT) + own + TINY
+        tilt, value = (torch.where(torch.isfinite(value), part, 0.0) for part in (tilt, sign * value + doubt))
+        return sign * tilt, torch.where(torch.isfinite(line_offset), value, radius)
+
+    (up, above_value), (down, below_value) = relative(above, high, 1.0), relative(below, low, -1.0)
+    tilt, value = torch.cat([up, down], dim=-1), torch.cat([above_value, below_value], dim=-1)
+    twice = torch.cat([magnitude, magnitude], dim=-1)
+    lead = torch.stack([value, tilt.abs() * twice + value.abs()], dim=-1)
+    lines = torch.cat([lead, tilt[..., None] * torch.cat([coefficients, coefficients], dim=-2)], dim=-1)
+    carried = magnitude * (error * SAFETY)
+    linear = radius <= LINEAR * (slope.abs() * magnitude + offset.abs())
+    return _Stacked(
+        r.first,
+        last,
+        kept=~linear.all(1),
+        inverse=1.0 / radius,
+        lines=lines,
+        input=_signed(carried, magnitude, coefficients),
+    )
+
+
+def _planes(group: list[Relaxed], cells: int, magnitude: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """A product in all steps: tilts, and the other attributes of :class:`Product` by name."""
+    r, factors = group[0], [q.factors for q in group]
+    plus, minus, size, middle, carried = (
+        _stack(factors, name, cells) for name in ("plus", "minus", "size", "middle", "magnitude")
+    )
+    sums, differences = (_rows(factors, cells, name) for name in ("sum", "difference"))
+    tilts = torch.cat([differences, sums], dim=-2)
+    own = magnitude * ((2 * r.error + 24 * UNIT) * SAFETY)
+
+    def both(upper: Tensor, lower: Tensor) -> Tensor:
+        return torch.cat([upper, lower], dim=-1)
+
+    free = both(torch.minimum(minus, 2 * size - plus), torch.minimum(plus, 2 * size - minus)).clamp(min=0.0)
+    return torch.nn.functional.pad(tilts, (0, r.first - tilts.shape[-1])), {
+        "top": 0.25 * both(plus * plus, minus * minus),
+        "free": free,
+        "size": both(size, size),
+        "offset": both(own - middle, own + middle),
+        "middle": both(middle.abs(), middle.abs()),
+        "magnitude": both(carried, carried),
+        "rounding": both(carried, carried) * ((r.error + 8 * UNIT) * SAFETY),
+    }
+
+
+def _lines(group: list[Relaxed], shape: torch.Size) -> Iterator[Tensor]:
+    """The operation's lines in all steps, found in one call."""
+    r = group[0]
+    lower, upper = torch.stack([q.lower for q in group]), torch.stack([q.upper for q in group])
+    return (part.reshape(shape) for part in r.operation.lines(lower, upper, *r.parameters))
+
+
+def _signed(carried: Tensor, magnitude: Tensor, coefficients: Tensor) -> Tensor:
+    """Rows for entries and for minus the entries: error carried, magnitude, coefficients."""
+    lead = torch.stack([carried, magnitude], dim=-1)
+    return torch.cat([torch.cat([lead, coefficients], dim=-1), torch.cat([lead, -coefficients], dim=-1)], dim=-2)
+
+
+def _stack(group: Sequence[Any], name: str, cells: int) -> Tensor:
+    """One attribute of all steps, ``(steps, B, entries)``."""
+    return torch.stack([getattr(q, name) for q in group]).reshape(len(group), cells, -1)
+
+
+def _rows(group: Sequence[Any], cells: int, name: str = "coefficients") -> Tensor:
+    """Coefficients of all steps, ``(steps, B, entries, variables)``."""
+    stacked = torch.stack([getattr(q, name) for q in group], dim=1)
+    return stacked.reshape(stacked.shape[0], len(group), cells, -1).movedim(0, -1)

@@ -1,0 +1,1 @@
+"""auto_LiRPA, the reference to compare with."""

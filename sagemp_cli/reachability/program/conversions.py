@@ -1,0 +1,66 @@
+"""Conversions of traced values, and what a set cannot be asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.program.value import ANSWERS, Traced, answers
+
+
+def same_type(dtype: Any) -> None:
+    """Refuse all types but float64."""
+    if dtype not in (None, torch.float64, torch.double):
+        raise UnsupportedOperationError(
+            f"conversion to {dtype}: rounding is not part of the real-arithmetic loop that is bounded; "
+            f"leave the conversion out (float32 weights are taken as the exact numbers they are)"
+        )
+
+
+@answers("to", "type", "type_as")
+def converted(x: Traced, *args: Any, **kwargs: Any) -> Traced:
+    """The value itself; only to float64 and on the CPU."""
+    for target in (*args, *kwargs.values()):
+        if isinstance(target, torch.dtype):
+            same_type(target)
+        elif isinstance(target, (Tensor, Traced)):
+            same_type(target.dtype)
+        elif isinstance(target, (torch.device, str)) and str(target) not in ("cpu", "torch.DoubleTensor"):
+            raise UnsupportedOperationError(f"conversion to {target}: a step is bounded on the CPU in float64")
+    return x._like(x.ids)
+
+
+@answers("double", "cpu")
+def same(x: Traced) -> Traced:
+    """The value itself."""
+    return x._like(x.ids)
+
+
+_TYPES = {
+    "float": torch.float32,
+    "half": torch.float16,
+    "bfloat16": torch.bfloat16,
+    "int": torch.int32,
+    "long": torch.int64,
+}
+_CHOICES = (
+    "allclose eq equal ge greater greater_equal gt heaviside isclose le less less_equal lt ne not_equal sgn sign where"
+)
+_NUMBERS = "__bool__ __float__ __index__ __int__ item numpy tolist"
+
+for _word, _type in _TYPES.items():
+    ANSWERS[_word] = lambda x, _type=_type: same_type(_type)
+for _word in _CHOICES.split():
+    ANSWERS[_word] = lambda *_, _word=_word, **__: _refuse_choice(_word)
+for _word in _NUMBERS.split():
+    ANSWERS[_word] = lambda x, *_, **__: x._number()
+
+
+def _refuse_choice(name: str) -> None:
+    raise UnsupportedOperationError(
+        f"torch operation '{name}' chooses by a value, which on a set is neither True nor False; "
+        f"use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+    )

@@ -1,0 +1,236 @@
+"""How a stranger's step is called, and whether it is what it must be: a function of ``x`` and ``w`` only.
+
+Calling a function a few times can refute, never prove. What is bounded in the end is a program recorded from one
+call (:mod:`sagemp_cli.reachability.program.value`); the calls made here test that the program says what the step does.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.program.program import Program, Recorder
+from sagemp_cli.reachability.program.value import UFUNCS, Traced, exact
+from sagemp_cli.sets import Box
+
+TOLERANCE = 1e-9
+"""How far two float64 evaluations of the same formulas may differ, relative to 1 plus the size of the result."""
+
+
+class _Exact(Tensor):
+    """float64 tensors that meet float32 constants as the exact numbers those are, where torch would refuse or round."""
+
+    __deepcopy__ = lambda self, memo: self.clone()  # noqa: E731
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        # Numpy would hand over its own results through a protocol that is on its way out.
+        if ufunc.__name__ in UFUNCS and method == "__call__" and not options:
+            return UFUNCS[ufunc.__name__](*(torch.as_tensor(i) if isinstance(i, np.ndarray) else i for i in inputs))
+        plain = (i.detach().as_subclass(Tensor).numpy() if isinstance(i, Tensor) else i for i in inputs)
+        return torch.as_tensor(getattr(ufunc, method)(*plain, **options))
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
+        with torch._C.DisableTorchFunctionSubclass():
+            args = _widened(tuple(args))
+            kwargs = {key: _widened(value) for key, value in (kwargs or {}).items()}
+        return super().__torch_function__(function, types, args, kwargs)
+
+
+def _widened(value: Any) -> Any:
+    if isinstance(value, (list, tuple)) and not hasattr(value, "_fields"):
+        return type(value)(map(_widened, value)) if any(map(_contains_tensor, value)) else value
+    narrow = isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float16, torch.bfloat16)
+    return value.detach().to(torch.float64) if narrow else value
+
+
+def _contains_tensor(value: Any) -> bool:
+    return isinstance(value, (Tensor, list, tuple))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a stranger's loop as it wants to be called.
+
+    Attributes:
+        function: ``(k, x, w) -> x_next``.
+        batched: whether it takes batches ``(B, n)`` and ``(B, d)`` only; else it takes ``(n,)`` and ``(d,)``.
+        rowwise: whether it may be called on batches to save time, because it steps their rows one by one.
+    """
+
+    function: Callable[[int, Any, Any], Any]
+    batched: bool = False
+    rowwise: bool = False
+
+    def all(self, k: int, xs: Tensor, ws: Tensor) -> Tensor:
+        """The next states ``(B, n)`` from states ``(B, n)`` and disturbances ``(B, d)`` in plain float64."""
+        if self.rowwise:
+            xs, ws = (v.detach().clone().as_subclass(_Exact) for v in (xs, ws))
+            return self._plain(self._called(k, xs, ws), xs.shape)
+        return torch.stack([self.at(k, x, w) for x, w in zip(xs, ws, strict=True)])
+
+    def at(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        """The next state ``(n,)`` from a state ``(n,)`` and a disturbance ``(d,)`` in plain float64."""
+        x, w = (v.detach().clone().as_subclass(_Exact) for v in (x, w))
+        if self.batched:
+            x, w = x[None], w[None]
+        return self._plain(self._called(k, x, w), x.shape).reshape(-1)
+
+    def record(self, k: int, x: Tensor, w: Tensor) -> Program:
+        """The program of step k, recorded at one state and disturbance."""
+        recorder = Recorder(x, w)
+        inputs = [
+            Traced(recorder, ids[None].clone() if self.batched else ids.clone()) for ids in (recorder.x, recorder.w)
+        ]
+        shape = inputs[0].shape
+        with torch.no_grad():
+            result = self._called(k, *inputs)
+        if recorder.refusal is not None:
+            raise recorder.refusal
+        _check_result(result, shape)
+        if isinstance(result, Traced):
+            if result.recorder is not recorder:
+                raise UsageError("step returned a value of an earlier call; it must be a function of x and w only")
+            ids = result.ids
+        else:
+            ids = recorder.constant(exact(result, operation="return"))
+        return recorder.finish(ids.reshape(-1))
+
+    def _plain(self, result: Any, shape: torch.Size) -> Tensor:
+        _check_result(result, shape)
+        plain = result.detach().as_subclass(Tensor)
+        if plain.dtype.is_complex or plain.dtype is torch.bool:
+            raise UsageError(f"step returned numbers of type {plain.dtype}, expected real numbers")
+        return plain.to(torch.float64).clone()
+
+    def _called(self, k: int, x: Any, w: Any) -> Any:
+        try:
+            return self.function(k, x, w)
+        except SagempError as error:
+            raise type(error)(f"{_line(error)}{error}") from error
+        except Exception as error:  # a stranger's code may raise anything
+            first = (str(error).strip().splitlines() or [""])[0]
+            kind = UnsupportedOperationError if isinstance(x, Traced) else UsageError
+            shapes = f"a state of shape {tuple(x.shape)} and a disturbance of shape {tuple(w.shape)}"
+            manner = "on sets" if isinstance(x, Traced) else f"on {shapes}"
+            raise kind(f"{_line(error)}step fails {manner} with {type(error).__name__}: {first}") from error
+
+
+def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box, *, batched: bool | None) -> Step:
+    """The step, called the way it wants to be: tried on one state ``(n,)`` and on batches ``(B, n)``.
+
+    Raises:
+        UsageError: neither way gives states; or both do, but differ; or two calls with the same arguments differ.
+        NonFiniteError: NaN or infinity at a state of the start box.
+    """
+    generator = torch.Generator().manual_seed(0)
+    count = start.dim + disturbance.dim + 2  # unlike n, so that rows and columns cannot be taken for each other
+    xs, ws = start.sample(count, generator), disturbance.sample(count, generator)
+    unit = UsageError("not tried")
+    single, why_single = (None, unit) if batched is True else _tried(Step(function), xs, ws)
+    rows, why_rows = (None, unit) if batched is False else _tried(Step(function, batched=True), xs, ws)
+    together = None if batched is False else _tried(Step(function, batched=True, rowwise=True), xs, ws)[0]
+    if single is None and rows is None:
+        if batched is None and type(why_single) is type(why_rows) and type(why_single) is not UsageError:
+            raise why_single
+        if batched is not None:
+            raise why_rows if batched else why_single
+        raise UsageError(f"step works neither on one state ({why_single}) nor on a batch ({why_rows})")
+    first = rows if single is None else single
+    reproduced(Step(function, batched=single is None), xs, ws, first)
+    _same_on_plain_tensors(function, xs, ws, first, batched=single is None)
+    # A batch means something only if its rows are stepped one by one: x[0] of a batch is a row, not a state's entry.
+    rowwise = rows is not None and together is not None and agree(together, rows)
+    if single is None and not rowwise:
+        raise UsageError("step mixes the rows of a batch: a row's next state depends on the other rows")
+    if rowwise and not agree(rows, first):
+        raise UsageError(
+            f"step means one thing for a state of shape ({start.dim},) and another for a batch ({count}, {start.dim}); "
+            f"say which is meant with batched=False or batched=True"
+        )
+    return Step(function, batched=single is None, rowwise=rowwise)
+
+
+def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
+    """Refuse a step that gives other results than before; under autograd, too."""
+    for grad in (False, True):
+        try:
+            with torch.set_grad_enabled(grad):
+                after = step.all(0, xs, ws)
+        except SagempError as error:
+            raise UsageError(
+                f"step works when it is called first and fails when it is called again ({error}); it must be a "
+                f"function of x and w only, no state kept between calls"
+            ) from error
+        if not torch.equal(after, before):
+            raise UsageError(
+                f"step gives another result when it is called again with the same x and w (difference "
+                f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness "
+                f"(dropout: call .eval()), no counters, no state kept between calls"
+            )
+
+
+def _same_on_plain_tensors(
+    function: Callable[[int, Any, Any], Any], xs: Tensor, ws: Tensor, before: Tensor, *, batched: bool
+) -> None:
+    """Refuse a step that does something else on plain float64 tensors, where it runs on these at all.
+
+    It often does not (float32 weights), or rounds to float32: hence the tolerance.
+    """
+    for x, w, expected in zip(xs, ws, before, strict=True):
+        try:
+            with torch.no_grad():
+                result = function(0, x[None].clone(), w[None].clone()) if batched else function(0, x.clone(), w.clone())
+            plain = result.to(torch.float64).reshape(expected.shape)
+        except Exception:  # a stranger's code may raise anything
+            return
+        if not bool(((plain - expected).abs() <= 1e-4 * (1.0 + expected.abs())).all()):
+            raise UsageError("step gives another result on plain float64 tensors; it must not look at their type")
+
+
+def agree(a: Tensor, b: Tensor) -> bool:
+    """Whether two float64 evaluations agree up to rounding."""
+    return a.shape == b.shape and bool(((a - b).abs() <= TOLERANCE * (1.0 + b.abs())).all())
+
+
+def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, SagempError]:
+    """Results ``(B, n)`` of single calls, or why there are none."""
+    try:
+        with torch.no_grad():
+            states = step.all(0, xs, ws)
+    except SagempError as error:
+        return None, error
+    finite = torch.isfinite(states).all(-1)
+    if not bool(finite.all()):
+        i = int(finite.long().argmin())
+        return None, NonFiniteError(
+            f"step gives NaN or infinity in state {int(torch.isfinite(states[i]).long().argmin())} "
+            f"at x = {xs[i].tolist()}, w = {ws[i].tolist()} of the start and disturbance boxes"
+        )
+    return states, UsageError("it works")
+
+
+def _check_result(result: Any, shape: torch.Size) -> None:
+    if not isinstance(result, (Tensor, Traced)):
+        raise UsageError(
+            f"step returned a {type(result).__name__}, expected the next state as a tensor of shape {tuple(shape)}"
+        )
+    if result.shape != shape:
+        raise UsageError(f"step returned shape {tuple(result.shape)}, expected {tuple(shape)} as that of x")
+
+
+def _line(error: BaseException) -> str:
+    """``"file.py, line 7: "`` of the stranger's own code that led to the error."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if not {"torch", "sagemp_cli", "numpy"} & set(path.parts) and not frame.filename.startswith("<"):
+            return f"{path.name}, line {frame.lineno}: "
+    return ""

@@ -1,0 +1,373 @@
+"""Values that stand in for tensors while a stranger's step is recorded, and mean exactly what torch's tensors mean.
+
+A :class:`Traced` value is a tensor of ids (:class:`~sagemp_cli.reachability.program.program.Recorder`). Whatever only
+moves entries (indexing, reshaping, stacking, views, assignment in place) is done by torch itself on the ids, so that
+shapes, views and aliases are torch's own. Arithmetic and the functions that have a relaxation are written into the
+program. All else is an error that names the operation; above all, nothing may ask for the number that a value has: a
+set has none.
+
+Constants are taken as the exact numbers they are: float32 weights are not rounded, nor is anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.form import unsupported
+from sagemp_cli.reachability.program.program import Recorder
+
+_CLAMPS = ("clamp", "clip", "clamp_min", "clamp_max", "maximum", "minimum", "fmax", "fmin", "max", "min", "hardtanh")
+"""Functions whose limits may be infinite."""
+
+_RESHAPES = ("t_", "transpose_", "swapaxes_", "swapdims_", "squeeze_", "unsqueeze_", "resize_", "resize_as_", "set_")
+"""Methods that change a tensor's shape and not its entries."""
+
+
+def exact(value: Any, *, operation: str) -> Tensor:
+    """A constant as float64 tensor, none of its numbers changed.
+
+    Raises:
+        NonFiniteError: NaN, or infinity where it is no limit of a clamp.
+        UnsupportedOperationError: no real number, or one that float64 cannot hold.
+    """
+    if isinstance(value, (np.ndarray, np.generic)):
+        if value.dtype.kind not in "biuf" or value.dtype.itemsize > 8 or value.dtype == np.uint64:
+            raise UnsupportedOperationError(
+                f"constant of '{operation}' has numpy type {value.dtype}, allowed are real numbers"
+            )
+        value = torch.tensor(value)
+    elif isinstance(value, int) and int(float(value)) != value:
+        raise UnsupportedOperationError(f"constant {value} of '{operation}' cannot be held in float64")
+    tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().cpu()
+    if tensor.layout is not torch.strided or tensor.dtype.is_complex or tensor.is_quantized:
+        raise UnsupportedOperationError(
+            f"constant of '{operation}' is {tensor.dtype} {tensor.layout}, allowed are dense real tensors"
+        )
+    double = tensor.to(torch.float64)
+    if not tensor.dtype.is_floating_point and not torch.equal(double.to(tensor.dtype), tensor):
+        raise UnsupportedOperationError(f"constant of '{operation}' has integers that float64 cannot hold")
+    bad = torch.isnan(double) if operation in _CLAMPS else ~torch.isfinite(double)
+    if bool(bad.any()):
+        where = torch.nonzero(bad)[0].tolist()
+        raise NonFiniteError(
+            f"constant of '{operation}', shape {tuple(double.shape)}, is {double[tuple(where)].item()} at {where}; "
+            f"it must be finite"
+        )
+    return double
+
+
+class Traced(Tensor):
+    """A value of a recorded step; see the module.
+
+    It is a tensor of torch's own kind, of the right shape and strides, so that code which takes its class at its word
+    finds what it expects. Whatever does not ask ``__torch_function__`` (constructors such as ``torch.tensor``,
+    transforms, compiled code) ends in ``__torch_dispatch__``, which refuses it; and what goes past that too reads NaN,
+    which no program may hold.
+    """
+
+    ids: Tensor
+    recorder: Recorder
+
+    @staticmethod
+    def __new__(cls, recorder: Recorder, ids: Tensor) -> Traced:
+        """A value whose entries have these ids."""
+        memory = torch.full((ids.untyped_storage().nbytes() // ids.element_size(),), torch.nan, dtype=torch.float64)
+        value = Tensor._make_subclass(cls, memory.as_strided(ids.size(), ids.stride(), ids.storage_offset()))
+        value.ids = ids
+        value.recorder = recorder
+        return value
+
+    __hash__ = object.__hash__
+
+    # -- what a tensor says of itself ---------------------------------------------------------------------------------
+
+    shape = property(lambda self: self.ids.shape)
+    ndim = property(lambda self: self.ids.dim())
+    dtype = property(lambda self: torch.float64)
+    device = property(lambda self: self.ids.device)
+    layout = property(lambda self: torch.strided)
+    requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
+    data = property(lambda self: self._like(self.ids))
+    T = property(lambda self: self._like(self.ids.T))
+    mT = property(lambda self: self._like(self.ids.mT))
+
+    def dim(self) -> int:
+        """Number of dimensions."""
+        return self.ids.dim()
+
+    ndimension = dim
+
+    def size(self, dim: int | None = None) -> Any:
+        """Shape, or one entry of it."""
+        return self.ids.size() if dim is None else self.ids.size(dim)
+
+    def numel(self) -> int:
+        """Number of entries."""
+        return self.ids.numel()
+
+    nelement = numel
+
+    def is_floating_point(self) -> bool:
+        """True."""
+        return True
+
+    is_contiguous = lambda self, *_, **__: self.ids.is_contiguous()  # noqa: E731
+    is_complex = lambda self: False  # noqa: E731
+
+    def __len__(self) -> int:
+        return len(self.ids) if self.ids.dim() else self._number()
+
+    def __iter__(self) -> Iterator[Traced]:
+        return iter([self._like(part) for part in self.ids])
+
+    def __copy__(self) -> Traced:
+        return self._like(self.ids)
+
+    def __deepcopy__(self, memo: Any) -> Traced:
+        return self._like(self.ids.clone())
+
+    def __repr__(self) -> str:
+        return f"Traced(shape={tuple(self.shape)})"
+
+    def _like(self, ids: Tensor) -> Traced:
+        return Traced(self.recorder, ids)
+
+    def _refuse(self, words: str) -> Any:
+        error = UnsupportedOperationError(words)
+        self.recorder.refusal = self.recorder.refusal or error
+        raise error
+
+    # -- entries ------------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, index: Any) -> Traced:
+        refuse_traced_index(index)
+        return self._like(self.ids[index])
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        refuse_traced_index(index)
+        self.ids[index] = ids_of(self.recorder, value, "assignment")
+
+    def _assign(self, value: Any, operation: str) -> Traced:
+        """What torch does in place: the ids of all views change with it."""
+        ids = ids_of(self.recorder, value, operation)
+        if torch.broadcast_shapes(ids.shape, self.ids.shape) != self.ids.shape:
+            raise UsageError(
+                f"step: '{operation}' cannot write shape {tuple(ids.shape)} into shape {tuple(self.ids.shape)}"
+            )
+        self.ids.copy_(ids)
+        return self
+
+    # -- what a set does not have -------------------------------------------------------------------------------------
+
+    def _compared(self, *_: Any) -> Any:
+        return self._refuse(
+            "comparison: a step may not branch on a value, the truth of a set is not one of True and False; "
+            "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+        )
+
+    __bool__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __contains__ = _compared
+
+    def _number(self, *_: Any, **__: Any) -> Any:
+        return self._refuse(
+            "float(), int(), item(), numpy, math.* and torch.tensor(...) ask for the number that a value has, "
+            "a set has none; "
+            "use torch's functions on the value itself, and torch.stack to put values together"
+        )
+
+    __float__ = __int__ = __index__ = __complex__ = __array__ = __round__ = __floor__ = __ceil__ = __trunc__ = _number
+    item = tolist = numpy = __format__ = _number
+
+    # -- operators ----------------------------------------------------------------------------------------------------
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(torch.Tensor, name, None)
+        if method is None or name.startswith("__"):
+            raise AttributeError(f"neither torch.Tensor nor a recorded value has '{name}'")
+        if not callable(method):
+            return self._refuse(str(unsupported(name)))
+        return lambda *args, **kwargs: _dispatch(method, (self, *args), kwargs)
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        return _dispatch(function, args, kwargs or {})
+
+    @classmethod
+    def __torch_dispatch__(
+        cls, function: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        """Refused: what comes here has gone past ``__torch_function__``."""
+        error = UnsupportedOperationError(
+            "torch.tensor(...), torch.Tensor(...), torch.asarray(...), torch.func, compiled and scripted code ask for "
+            f"the memory of a value ('{_plain_name(function)}'), a set has none; use torch's functions on the value "
+            "itself, and torch.stack to put values together"
+        )
+        _note(error, (*args, *(kwargs or {}).values()))
+        raise error
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        function = UFUNCS.get(ufunc.__name__)
+        if function is None or method != "__call__" or options:
+            return self._refuse(f"numpy operation '{ufunc.__name__}' does not work on sets; use torch.{ufunc.__name__}")
+        return _dispatch(function, inputs, {})
+
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        return self._refuse(f"numpy operation '{function.__name__}' does not work on sets; use torch's")
+
+
+def _operator(function: Any, *, swapped: bool = False, in_place: bool = False) -> Callable[[Traced, Any], Any]:
+    def apply(self: Traced, *other: Any) -> Any:
+        result = _dispatch(function, (*other, self) if swapped else (self, *other), {})
+        return self._assign(result, function.__name__) if in_place else result
+
+    return apply
+
+
+for _name, _function in {
+    "add": torch.add,
+    "sub": torch.sub,
+    "mul": torch.mul,
+    "truediv": torch.div,
+    "pow": torch.pow,
+    "matmul": torch.matmul,
+    "floordiv": torch.floor_divide,
+    "mod": torch.remainder,
+    "and": torch.bitwise_and,
+    "or": torch.bitwise_or,
+    "xor": torch.bitwise_xor,
+}.items():
+    setattr(Traced, f"__{_name}__", _operator(_function))
+    setattr(Traced, f"__r{_name}__", _operator(_function, swapped=True))
+    setattr(Traced, f"__i{_name}__", _operator(_function, in_place=True))
+for _name, _function in {
+    "neg": torch.neg,
+    "pos": torch.positive,
+    "abs": torch.abs,
+    "invert": torch.bitwise_not,
+}.items():
+    setattr(Traced, f"__{_name}__", _operator(_function))
+
+UFUNCS = {
+    "add": torch.add,
+    "subtract": torch.sub,
+    "multiply": torch.mul,
+    "true_divide": torch.div,
+    "divide": torch.div,
+    "negative": torch.neg,
+    "matmul": torch.matmul,
+}
+"""Numpy's functions that strangers reach by operators between arrays and tensors."""
+
+ANSWERS: dict[Any, Callable[..., Any]] = {}
+"""What torch functions and tensor methods do on traced values: by name, or the function itself."""
+
+
+def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register what torch functions do, given by their names or as they are."""
+
+    def register(implementation: Callable[..., Any]) -> Callable[..., Any]:
+        for function in functions:
+            ANSWERS[function] = implementation
+        return implementation
+
+    return register
+
+
+def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    try:
+        return _answered(function, args, kwargs)
+    except SagempError as error:
+        # A step that catches the error must not go on with something else than what it does on tensors.
+        _note(error, (*args, *kwargs.values()))
+        raise
+
+
+def _note(error: SagempError, values: Iterable[Any]) -> None:
+    """Remember a refusal with the recorder of the values that it is about."""
+    for value in values:
+        if isinstance(value, Traced):
+            value.recorder.refusal = value.recorder.refusal or error
+        elif type(value) in (list, tuple, dict):
+            _note(error, value.values() if isinstance(value, dict) else value)
+
+
+def _plain_name(function: Any) -> str:
+    """``aten.add.Tensor`` is ``add``."""
+    return str(getattr(getattr(function, "overloadpacket", function), "__name__", function))
+
+
+def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    name = getattr(function, "__name__", str(function))
+    if name == "__get__":
+        raise unsupported(str(getattr(function, "__self__", name)))
+    if kwargs.get("out") is not None:
+        raise UnsupportedOperationError(f"torch operation '{name}' is not supported with out=")
+    kwargs = {key: value for key, value in kwargs.items() if key != "out"}
+    if kwargs.pop("inplace", False):
+        return args[0]._assign(_dispatch(function, args, kwargs), name)
+    if name.endswith("_") and not name.endswith("__"):
+        return _in_place(name, args, kwargs)
+    answer = ANSWERS.get(name) or ANSWERS.get(function)
+    if answer is None:
+        raise unsupported(name)
+    try:
+        return answer(*args, **kwargs)
+    except TypeError as error:
+        raise UnsupportedOperationError(
+            f"torch operation '{name}' is not supported with these arguments: {error}"
+        ) from error
+
+
+def _in_place(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Traced:
+    target, rest = args[0], args[1:]
+    if not isinstance(target, Traced):
+        raise UnsupportedOperationError(
+            f"torch operation '{name}' writes into a plain tensor, which cannot hold a set; "
+            f"start from torch.zeros_like(x)"
+        )
+    if name in ("detach_", "requires_grad_"):
+        return target
+    if name in ("copy_", "fill_"):
+        return target._assign(rest[0], name)
+    if name == "zero_":
+        return target._assign(0.0, name)
+    function = getattr(torch.Tensor, name[:-1], None)
+    if function is None or name in _RESHAPES:
+        raise unsupported(name)
+    return target._assign(_dispatch(function, args, kwargs), name)
+
+
+def refuse_traced_index(index: Any) -> None:
+    """An index is a constant, or an error."""
+    if any(isinstance(i, Traced) for i in (index if isinstance(index, (tuple, list)) else (index,))):
+        raise UnsupportedOperationError(
+            "indexing: a step may not look entries up by a value, a set names no single entry"
+        )
+
+
+def is_tensor(value: Any) -> bool:
+    """Whether the value takes part in broadcasting, as Python numbers do not."""
+    return isinstance(value, (Traced, Tensor, np.ndarray, np.generic))
+
+
+def ids_of(recorder: Recorder, value: Any, operation: str) -> Tensor:
+    """Ids of a value, or of a constant."""
+    if isinstance(value, Traced):
+        if value.recorder is not recorder:
+            raise UsageError(
+                "step uses a value of an earlier call; it must be a function of x and w only, with no state of its own"
+            )
+        return value.ids
+    return recorder.constant(exact(value, operation=operation))
+
+
+def recorder_of(*values: Any) -> Recorder:
+    """The recorder of the traced value among these."""
+    return next(v.recorder for v in values if isinstance(v, Traced))

@@ -1,0 +1,137 @@
+"""Adaptive partitions: cells are split where the proof fails, along the dimension that turns out to help most.
+
+A partition begins with one cell per reference. In each round every cell whose tube is not SAFE by itself is halved in
+each uncertain dimension for trial, all trials of all references in one batch, and the dimension is kept whose two
+halves together miss least. Rounds go on until all is SAFE, the budget is spent, or it is plain that a reference will
+not be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face
+exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.cells import CellTubes
+
+PATIENCE = 3
+"""Splits in a row that may be in vain, before a cell, and with it its reference, is given up."""
+
+GAIN = 0.02
+"""A split is in vain if its halves miss on average more than ``1 - GAIN`` of what the whole cell missed."""
+
+_TIE = 1e-6
+"""Relative difference of what is missing below which the narrower tubes decide."""
+
+
+def adaptive_cells(
+    prove: Callable[[Tensor, Box], CellTubes],
+    start: Box,
+    *,
+    budget: int,
+    shortfall: Callable[[Tube], tuple[Tensor, Tensor]],
+    hopeless: Callable[[Tensor, Box], Tensor],
+) -> CellTubes:
+    """Cells that cover each start box, at most ``budget`` for each, split where it pays.
+
+    What this costs: up to ``2 d`` propagated cells for each split, d the number of uncertain dimensions.
+
+    Args:
+        prove: ``prove(cell_reference (B,), cells (B, n))``, the tubes of cells.
+        start: X_I of each reference, ``(R, n)``.
+        budget: cells of one reference at most, the trials that were given up not counted.
+        shortfall: of tubes, whether each is SAFE and how much is missing; see
+            :func:`~sagemp_cli.verification.verdict.shortfall`.
+        hopeless: ``hopeless(cell_reference (B,), cells (B, n))`` says of which cells a rollout is known that breaks the
+            claim; a reference with such a cell is split no further.
+
+    Returns:
+        The cells, sorted by reference and corner. They cover every start box whether or not all of them are SAFE.
+    """
+    count = len(start.lower)
+    found = prove(torch.arange(count), start)
+    given_up = torch.zeros(count, dtype=torch.bool)
+    fresh = torch.ones(count, dtype=torch.bool)  # cells that were not yet tried for a violating rollout
+    vain = torch.zeros(count, dtype=torch.int64)  # splits in a row that did not help, per cell
+    while True:
+        safe, missing = shortfall(found.tube)
+        doubtful = torch.nonzero(fresh & ~safe).flatten()
+        owners = found.cell_reference[doubtful]
+        if len(doubtful):
+            given_up[owners[hopeless(owners, _box(found, doubtful))]] = True
+        given_up[found.cell_reference[(vain >= PATIENCE) & ~safe]] = True
+        fresh.zero_()
+        chosen = _worst(found.cell_reference, safe | given_up[found.cell_reference], missing, budget)
+        parents, halves = _halves(_box(found, chosen))
+        if not len(parents):
+            break
+        trial = prove(found.cell_reference[chosen[parents]].repeat_interleave(2), halves)
+        best, left = _best(parents, trial, shortfall)
+        split = chosen[parents[best]]
+        more = torch.where(left > 2 * (1 - GAIN) * missing[split], vain[split] + 1, 0)
+        whole = torch.ones(len(found), dtype=torch.bool)
+        whole[split] = False
+        found = CellTubes.join([found.select(torch.nonzero(whole).flatten()), trial.select(_pairs(best))])
+        fresh = torch.cat([fresh[whole], torch.ones(2 * len(best), dtype=torch.bool)])
+        vain = torch.cat([vain[whole], more.repeat_interleave(2)])
+    return found.select(_sorted(found))
+
+
+def _box(found: CellTubes, index: Tensor) -> Box:
+    return Box(found.cells.lower[index], found.cells.upper[index])
+
+
+def _worst(owner: Tensor, done: Tensor, missing: Tensor, budget: int) -> Tensor:
+    """The cells to split: of each reference those that miss most, as many as its budget has room for."""
+    room = budget - owner.bincount()
+    chosen = []
+    for cell in missing.argsort(descending=True, stable=True).tolist():
+        if not done[cell] and room[owner[cell]] > 0:
+            room[owner[cell]] -= 1
+            chosen.append(cell)
+    return torch.tensor(chosen, dtype=torch.int64)
+
+
+def _halves(cells: Box) -> tuple[Tensor, Box]:
+    """The parent of each trial, and its two halves one after the other, ``(2 trials, n)``."""
+    parents, lowers, uppers = [], [], []
+    for parent, (low, high) in enumerate(zip(cells.lower, cells.upper, strict=True)):
+        for dimension in torch.nonzero(high > low).flatten().tolist():
+            counts = [2 if i == dimension else 1 for i in range(cells.dim)]
+            halves = Box(low, high).split(counts)
+            if bool((halves.width[:, dimension] > 0).all()):  # else there is no number between the faces
+                parents.append(parent)
+                lowers.append(halves.lower)
+                uppers.append(halves.upper)
+    none = torch.zeros(0, cells.dim, dtype=torch.float64)
+    return torch.tensor(parents, dtype=torch.int64), Box(torch.cat([none, *lowers]), torch.cat([none, *uppers]))
+
+
+def _best(
+    parents: Tensor, trial: CellTubes, shortfall: Callable[[Tube], tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """The trial of each parent whose halves miss least together, by narrower tubes if tied, and what those miss."""
+    missing = shortfall(trial.tube)[1].unflatten(0, (-1, 2)).sum(1)
+    width = torch.nan_to_num(trial.tube.width, nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
+    spread = width.log().flatten(1).mean(1).unflatten(0, (-1, 2)).sum(1)
+    best = []
+    for parent in parents.unique().tolist():
+        own = torch.nonzero(parents == parent).flatten()
+        near = own[missing[own] <= missing[own].min() * (1 + _TIE)]
+        best.append(int(near[spread[near].argmin()]))
+    index = torch.tensor(best, dtype=torch.int64)
+    return index, missing[index]
+
+
+def _pairs(trials: Tensor) -> Tensor:
+    """Indices of both halves of trials."""
+    return torch.stack([2 * trials, 2 * trials + 1], dim=1).flatten()
+
+
+def _sorted(found: CellTubes) -> Tensor:
+    """The cells' order by reference, then by lower corner."""
+    keys = zip(found.cell_reference.tolist(), found.cells.lower.tolist(), range(len(found)), strict=True)
+    return torch.tensor([cell for *_, cell in sorted(keys)], dtype=torch.int64)

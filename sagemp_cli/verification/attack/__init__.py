@@ -1,0 +1,1 @@
+"""Attacks: rollouts that try to leave a tube or to violate the claim."""

@@ -1,0 +1,103 @@
+"""Attacks on verdicts: a reference that is not certified may be refuted, and a certified one must withstand."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.sets import Box
+from sagemp_cli.verification.attack.falsifier import Counterexample, falsify
+from sagemp_cli.verification.verdict import Outcome, Verdict
+from sagemp_cli.verification.verification import Verification
+
+RATES = (2.0, 1.0, 0.5, 0.5, 0.25, 0.25, 0.1, 0.1)
+SHORT_RATES = (2.0, 1.0, 0.5)
+
+
+class SoundnessError(Exception):
+    """A replayed rollout breaks what was certified: a bug of ours, never the user's fault."""
+
+
+@dataclass(frozen=True)
+class Refutation:
+    """What the attacks found.
+
+    Attributes:
+        verification: the same with verdict UNSAFE for each refuted reference.
+        counterexamples: index of the reference and the replayed rollout.
+        rollouts: simulated altogether.
+    """
+
+    verification: Verification
+    counterexamples: tuple[tuple[int, Counterexample], ...]
+    rollouts: int
+
+
+def attack(
+    verification: Verification,
+    dynamics: Dynamics,
+    *,
+    tracker: Tracker,
+    scene: Scene,
+    generator: torch.Generator,
+    restarts: int = 16,
+    safe_restarts: int = 2,
+    at_once: int = 4,
+    progress: Progress | None = None,
+) -> Refutation:
+    """Search for counterexamples by gradient ascent on starts and disturbances.
+
+    References that are not SAFE get ``restarts`` ascents per constraint, certified ones a short attack of
+    ``safe_restarts`` as a guard against our own bugs. Finding nothing proves nothing.
+
+    Args:
+        verification: what to attack.
+        dynamics, tracker, scene: what it speaks about.
+        generator: draws where the ascents begin.
+        restarts: ascents per constraint of a reference that is not certified; 0 leaves them alone.
+        safe_restarts: the same for certified ones.
+        at_once: references in one batch, which bounds the memory.
+        progress: reports references.
+
+    Raises:
+        SoundnessError: a certified reference was refuted.
+    """
+    verdicts, found, rollouts = list(verification.verdicts), [], 0
+    attacks = len(scene.constraint_names) + 1
+    with (progress or Silent()).task("searching for counterexamples", len(verdicts)) as task:
+        for safe, starts, rates in ((False, restarts, RATES), (True, safe_restarts, SHORT_RATES)):
+            targets = [r for r, v in enumerate(verification.verdicts) if (v.outcome is Outcome.SAFE) is safe]
+            for begin in range(0, len(targets), at_once):
+                some = targets[begin : begin + at_once]
+                if starts > 0:
+                    examples = falsify(
+                        ClosedLoop(dynamics, tracker, verification.references[some]),
+                        Box(verification.start.lower[some], verification.start.upper[some]),
+                        verification.disturbance,
+                        scene=scene,
+                        position=dynamics.position,
+                        generator=generator,
+                        restarts=starts,
+                        rates=rates,
+                    )
+                    rollouts += starts * attacks * (len(rates) + 1) * len(some)
+                    for r, example in zip(some, examples, strict=True):
+                        if example is None:
+                            continue
+                        if safe:
+                            raise SoundnessError(
+                                f"reference {r} was certified by '{verification.propagator}', but a replayed rollout "
+                                f"breaks '{example.name}' at step {example.step} by {example.depth:.3g}; "
+                                "please report this"
+                            )
+                        found.append((r, example))
+                        verdicts[r] = Verdict(Outcome.UNSAFE, example.step, example.name)
+                task.advance(len(some))
+    return Refutation(dataclasses.replace(verification, verdicts=tuple(verdicts)), tuple(found), rollouts)

@@ -1,0 +1,230 @@
+"""Cells to prove, in chunks that can be proved anywhere, and what was proved of them.
+
+A chunk is proved by itself: its tubes depend on its own cells and references and on the prover, not on who proves it
+or when. So executors may share chunks out, and finished ones may be kept and read again. (They do depend, in the last
+bits, on which cells are together in a chunk.)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.workers import one_thread
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Cells that are propagated in one call.
+
+    Attributes:
+        index: number of the chunk in its run.
+        cell_reference: which reference each cell belongs to, ``(B,)``.
+        references: that reference, ``(B, K+1, n)``.
+        cells: ``(B, n)``.
+    """
+
+    index: int
+    cell_reference: Tensor
+    references: Tensor
+    cells: Box
+
+    def __len__(self) -> int:
+        return len(self.cell_reference)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it but the index as arrays by name, to send it elsewhere."""
+        found = {
+            "cell_reference": self.cell_reference,
+            "references": self.references,
+            "lower": self.cells.lower,
+            "upper": self.cells.upper,
+        }
+        return {name: tensor.numpy() for name, tensor in found.items()}
+
+    @classmethod
+    def of(cls, index: int, arrays: Mapping[str, np.ndarray]) -> Chunk:
+        """Back from :meth:`arrays`."""
+        owner, references, lower, upper = (
+            torch.from_numpy(arrays[name].copy()) for name in ("cell_reference", "references", "lower", "upper")
+        )
+        return cls(index, owner, references, Box(lower, upper))
+
+
+@dataclass(frozen=True)
+class CellTubes:
+    """What was proved of C cells.
+
+    Attributes:
+        cell_reference: which reference each belongs to, ``(C,)``.
+        cells: ``(C, n)``.
+        tube: ``(C, K+1, n)``.
+        control_lower, control_upper: bounds of the controls, ``(C, K, m)``; infinite if the propagator offers none.
+        seconds: share of the propagation time, ``(C,)``.
+        recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
+    """
+
+    cell_reference: Tensor
+    cells: Box
+    tube: Tube
+    control_lower: Tensor
+    control_upper: Tensor
+    seconds: Tensor
+    recording: Recording | None
+
+    def __len__(self) -> int:
+        return len(self.cell_reference)
+
+    def select(self, index: Tensor) -> CellTubes:
+        """The same for some of the cells, in the given order."""
+        return CellTubes(
+            self.cell_reference[index],
+            Box(self.cells.lower[index], self.cells.upper[index]),
+            Tube(self.tube.lower[index], self.tube.upper[index]),
+            self.control_lower[index],
+            self.control_upper[index],
+            self.seconds[index],
+            None if self.recording is None else self.recording.select(index),
+        )
+
+    @staticmethod
+    def join(parts: Sequence[CellTubes]) -> CellTubes:
+        """All cells, one part after the other."""
+        recordings = [p.recording for p in parts]
+        if len(parts) == 1:
+            return parts[0]
+        return CellTubes(
+            torch.cat([p.cell_reference for p in parts]),
+            Box(torch.cat([p.cells.lower for p in parts]), torch.cat([p.cells.upper for p in parts])),
+            Tube(torch.cat([p.tube.lower for p in parts]), torch.cat([p.tube.upper for p in parts])),
+            torch.cat([p.control_lower for p in parts]),
+            torch.cat([p.control_upper for p in parts]),
+            torch.cat([p.seconds for p in parts]),
+            Recording.join(recordings),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it as arrays by name, without pickles: what is sent between processes and kept on disk."""
+        found = {
+            "cell_reference": self.cell_reference,
+            "cell_lower": self.cells.lower,
+            "cell_upper": self.cells.upper,
+            "tube_lower": self.tube.lower,
+            "tube_upper": self.tube.upper,
+            "control_lower": self.control_lower,
+            "control_upper": self.control_upper,
+            "seconds": self.seconds,
+        }
+        if self.recording is not None:
+            r = self.recording
+            found |= {"slope": r.slope, "offset": r.offset, "radius": r.radius}
+            found |= {} if r.kept is None else {"kept": r.kept}
+        arrays = {name: tensor.detach().numpy() for name, tensor in found.items()}
+        if self.recording is not None:
+            arrays["operations"] = np.array(self.recording.operations, dtype=np.str_)
+            arrays["widths"] = np.array(self.recording.widths, dtype=np.int64)
+        return arrays
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> CellTubes:
+        """Back from :meth:`arrays`.
+
+        Raises:
+            KeyError: an array is missing.
+        """
+        found = {name: torch.from_numpy(a) for name, a in arrays.items() if a.dtype.kind != "U"}
+        recording = None
+        if "operations" in arrays:
+            recording = Recording(
+                tuple(str(name) for name in arrays["operations"]),
+                tuple(found["widths"].tolist()),
+                found["slope"],
+                found["offset"],
+                found["radius"],
+                found.get("kept"),
+            )
+        return cls(
+            found["cell_reference"],
+            Box(found["cell_lower"], found["cell_upper"]),
+            Tube(found["tube_lower"], found["tube_upper"]),
+            found["control_lower"],
+            found["control_upper"],
+            found["seconds"],
+            recording,
+        )
+
+
+@dataclass(frozen=True)
+class CellProver:
+    """What all chunks of a run have in common.
+
+    Attributes:
+        propagator: bounds the loop.
+        dynamics: the robot.
+        tracker: the policy.
+        disturbance: W, ``(d,)``.
+    """
+
+    propagator: Propagator
+    dynamics: Dynamics
+    tracker: Tracker
+    disturbance: Box
+
+    def prove(self, chunk: Chunk) -> CellTubes:
+        """Bound states and controls of every cell, with one thread wherever it runs."""
+        loop = ClosedLoop(self.dynamics, self.tracker, chunk.references)
+        began = time.perf_counter()
+        with torch.no_grad(), one_thread():
+            tube, u_lower, u_upper, recording = self._bound(loop, chunk.cells)
+            least, most = self.tracker.control_range()
+            more = (0, u_lower.shape[-1] - len(least))  # columns of a deviation, which may follow
+            u_lower = torch.maximum(u_lower, torch.nn.functional.pad(least, more, value=-torch.inf))
+            u_upper = torch.minimum(u_upper, torch.nn.functional.pad(most, more, value=torch.inf))
+        share = (time.perf_counter() - began) / len(chunk)
+        seconds = torch.full((len(chunk),), share, dtype=torch.float64)
+        return CellTubes(chunk.cell_reference, chunk.cells, tube, u_lower, u_upper, seconds, recording)
+
+    def _bound(self, loop: ClosedLoop, start: Box) -> tuple[Tube, Tensor, Tensor, Recording | None]:
+        """As much as the propagator offers: a tube, bounds of the controls, the relaxations."""
+        prove = getattr(self.propagator, "prove", None)
+        if prove is not None:
+            return prove(loop, start, self.disturbance)
+        with_controls = getattr(self.propagator, "propagate_with_controls", None)
+        if with_controls is not None:
+            return *with_controls(loop, start, self.disturbance), None
+        tube = self.propagator.propagate(loop, start, self.disturbance)
+        unknown = torch.full((*tube.lower.shape[:-2], loop.horizon, self.dynamics.control_dim), torch.inf)
+        return tube, -unknown.double(), unknown.double(), None
+
+
+class Run(Protocol):
+    """Proves chunks and hands each over, with its index, as soon as it is finished."""
+
+    def __call__(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, CellTubes]]:
+        """In any order."""
+
+
+class Pieces(Protocol):
+    """Where finished chunks are kept, so that an interrupted run resumes."""
+
+    @property
+    def finished(self) -> Collection[int]:
+        """Indices of the chunks that are there."""
+
+    def load(self, index: int) -> Mapping[str, np.ndarray]:
+        """What :meth:`save` was given."""
+
+    def save(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep a finished chunk."""

@@ -1,0 +1,28 @@
+"""What a proof speaks about: robot, scene, sets, horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.sets import Box
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that a proof speaks about except the reference and the tracker.
+
+    Attributes:
+        dynamics: the robot.
+        scene: safe set and goal.
+        start: X_I, ``(n,)``.
+        disturbance: W, ``(n,)``.
+        horizon: number of steps K.
+    """
+
+    dynamics: Dynamics
+    scene: Scene
+    start: Box
+    disturbance: Box
+    horizon: int

@@ -1,0 +1,58 @@
+"""Best: inside both of its parts, better with rounds, and honest about what it is given."""
+
+import pytest
+import torch
+
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.crown.best import Best
+from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.sets import Box
+
+from ..propagator_cases import DISTURBANCE, START, EveryOperation, line, unicycle_loop
+
+WIDE = Box.around([0.0, 0.0, 0.1, 1.0], [0.3, 0.3, 0.5, 0.4])
+
+
+@pytest.mark.parametrize("start", [START, WIDE], ids=["narrow", "wide"])
+def test_the_tube_lies_inside_those_of_affine_and_crown_exactly(start):
+    loop = unicycle_loop(line(0.3))
+    best = Best().propagate(loop, start, DISTURBANCE)
+    for part in (Affine(), Crown()):
+        tube = part.propagate(loop, start, DISTURBANCE)
+        assert bool((best.lower >= tube.lower).all()) and bool((best.upper <= tube.upper).all())
+
+
+def test_more_rounds_never_widen_and_pay_where_the_set_is_wide():
+    loop = unicycle_loop(line(0.3), gain=0.8)
+    widths = [Best(rounds=n).propagate(loop, WIDE, DISTURBANCE).width for n in (1, 2, 4)]
+    assert bool((widths[1] <= widths[0]).all()) and bool((widths[2] <= widths[1]).all())
+    assert float(widths[1][-1].mean()) < 0.97 * float(widths[0][-1].mean())
+
+
+def test_one_round_is_the_intersection_of_affine_and_crown():
+    loop, start = EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.2] * 3)
+    w = Box.around([0.0] * 3, [0.01] * 3)
+    best, affine, crown = (p.propagate(loop, start, w) for p in (Best(rounds=1), Affine(), Crown()))
+    torch.testing.assert_close(best.lower, torch.maximum(affine.lower, crown.lower), rtol=0, atol=0)
+    torch.testing.assert_close(best.upper, torch.minimum(affine.upper, crown.upper), rtol=0, atol=0)
+
+
+def test_hints_that_are_too_tight_break_the_tube():
+    # That sharper bounds of the inputs are used at all, and are trusted.
+    loop = unicycle_loop(line(0.3), gain=0.8)
+    run = Affine().run(loop, WIDE, DISTURBANCE, keep_steps=True)
+    point = [
+        [None if r.lower is None else (0.5 * (r.lower + r.upper),) * 2 for r in after.frame.relaxations]
+        for after in run.steps
+    ]
+    assert float(Affine().run(loop, WIDE, DISTURBANCE, hints=point).tube.width[-1].mean()) < float(
+        run.tube.width[-1].mean()
+    )
+
+
+def test_wrong_options_are_refused_in_one_line():
+    with pytest.raises(ConfigError, match="propagator.rounds must be a positive integer, found 0"):
+        Best(rounds=0)
+    with pytest.raises(ConfigError, match="propagator.rows must be a positive integer, found -1"):
+        Best(rows=-1)

@@ -1,0 +1,162 @@
+"""The backward pass: what it equals without choices, what its choices gain, and that wrong ones are caught."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from inner import attack_tube
+
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.crown import backward_steps
+from sagemp_cli.reachability.crown import crown as crown_module
+from sagemp_cli.reachability.crown.backward import _swept, _tilt
+from sagemp_cli.reachability.crown.backward_steps import Product, Step, compiled
+from sagemp_cli.reachability.crown.best import Best
+from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.interval.interval import Interval
+from sagemp_cli.reachability.lirpa import adapter as lirpa_adapter
+from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
+from sagemp_cli.reachability.relaxations.lines import parallel
+from sagemp_cli.sets import Box
+
+from ..propagator_cases import DISTURBANCE, START, AffineLoop, EveryOperation, line, unicycle_loop
+
+
+def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monkeypatch):
+    def edges(group, shape):
+        parts = zip(*(parallel(r.band) for r in group), strict=True)
+        return (torch.stack(part).reshape(shape) for part in parts)
+
+    monkeypatch.setattr(backward_steps, "_lines", edges)
+    for loop, start, w in (
+        (unicycle_loop(line(0.3)), START, DISTURBANCE),
+        (EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.1] * 3), Box.around([0.0] * 3, [0.01] * 3)),
+    ):
+        run = Affine().run(loop, start, w, keep_steps=True)
+        low, high = _swept(compiled(run.steps), start.radius, range(loop.horizon), False, False).state
+        torch.testing.assert_close(high - low, run.tube.width[1:], rtol=1e-7, atol=1e-12)
+
+
+def test_tilted_planes_contain_products_and_those_of_mccormick_are_among_them():
+    generator = torch.Generator().manual_seed(0)
+    draws = 2 * torch.rand(2, 4000, dtype=torch.float64, generator=generator) - 1
+    x, y = torch.cat([draws, torch.tensor([[1, 1, -1, -1], [1, -1, 1, -1]], dtype=torch.float64)], dim=1)
+    for correlation in (-1.0, -0.5, 0.0, 0.7, 1.0):
+        factor = x * (1 - abs(correlation)) + y * correlation
+        total, difference = factor + y, factor - y
+        plus, minus = total.abs().max(), difference.abs().max()
+
+        def both(upper, lower):
+            return np.array([upper, lower], dtype=float)[None, :, None]
+
+        def product(guess):
+            return Product(
+                tilts=np.eye(2)[None],  # the variables are M and P themselves
+                likely=both(guess, guess) * np.array([1.0, 0.0]),
+                top=0.25 * both(plus**2, minus**2),
+                free=both(min(minus, 2 - plus), min(plus, 2 - minus)),
+                size=both(1, 1),
+                offset=both(0, 0),
+                middle=both(0, 0),
+                magnitude=both(2, 2),
+                rounding=both(0, 0),
+            )
+
+        for guess in np.linspace(-2, 2, 9):
+            for upper, lower in ((1.0, 0.0), (0.0, 1.0)):  # of a row of +1 and of one of -1
+                head = np.zeros((1, 4, 1))
+                head[0, 2] = 1e-12  # of a row its direction decides, so it need not add anything to speak of
+                _tilt(head, both(upper, lower), product(guess), np.eye(2)[None], np.zeros((0, 1)))
+                gain, _, m, p = head[0, :, 0].tolist()
+                excess = gain + m * difference + p * total - (upper - lower) * factor * y
+                assert float(excess.min()) > -1e-11
+                if correlation == 0 and abs(guess) == 2:
+                    # McCormick's planes touch the product at three of the four corners.
+                    assert int((excess[-4:].abs() < 1e-11).sum()) == 3
+
+
+def broken(step: Step, kind: str) -> Step:
+    """A step with one mistake."""
+    if kind == "disturbance forgotten":
+        first = step.replacements[0]
+        return step._replace(replacements=(first._replace(radius=0 * first.radius), *step.replacements[1:]))
+    changed = []
+    for r in step.replacements:
+        entries = r.last - r.first
+        if kind == "upper and lower lines exchanged" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([r.lines[..., entries:], r.lines[..., :entries]], axis=-1))
+        if kind == "slopes of lines reversed" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([r.lines[:, :2], -r.lines[:, 2:]], axis=-2))
+        if kind == "offsets of lines halved" and r.lines is not None:
+            r = r._replace(lines=np.concatenate([0.5 * r.lines[:, :2], r.lines[:, 2:]], axis=-2))
+        if kind == "planes too low" and r.product is not None:
+            r = r._replace(product=r.product._replace(top=0.2 * r.product.top), radius=0.2 * r.radius)
+        changed.append(r)
+    return step._replace(replacements=tuple(changed))
+
+
+KINDS = [
+    "disturbance forgotten",
+    "upper and lower lines exchanged",
+    "slopes of lines reversed",
+    "offsets of lines halved",
+    "planes too low",
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mistake_in_the_backward_pass_is_caught_by_an_attack(kind, monkeypatch):
+    loop = unicycle_loop(line(0.3), gain=0.8)
+    start, w = Box.around([0.0, 0.0, 0.1, 1.0], [0.3, 0.3, 0.5, 0.4]), DISTURBANCE
+
+    def attack():
+        tube = Crown().propagate(loop, start, w)
+        return attack_tube(loop, start, w, tube, count=1500, generator=torch.Generator().manual_seed(4)).escapes
+
+    assert attack() == 0
+    right = crown_module.compiled
+    monkeypatch.setattr(crown_module, "compiled", lambda steps: [broken(s, kind) for s in right(steps)])
+    assert attack() > 0
+
+
+@pytest.mark.skipif(
+    lirpa_adapter._installed() is None and lirpa_adapter._carried() is None, reason="no auto_LiRPA is installed"
+)
+def test_widths_agree_with_auto_lirpa_on_the_unrolled_loop_within_what_its_intermediate_bounds_gain():
+    loop = unicycle_loop(line(0.3))
+    loop = ClosedLoop(loop.dynamics, loop.tracker, loop.references[:7])
+    crown, best, theirs = (p.propagate(loop, START, DISTURBANCE).width.mean() for p in (Crown(), Best(), AutoLirpa()))
+    assert float(best) <= float(theirs)
+    assert 0.97 * float(theirs) < float(crown) < 1.002 * float(theirs)
+
+
+@pytest.mark.parametrize("propagator", [Crown(), Interval()], ids=lambda p: p.name)
+def test_bounds_hold_in_exact_arithmetic_where_rounding_matters(propagator):
+    # Powers of two make every product exact, the offset of 2^40 makes every sum lose bits: the exact rollout moves by
+    # amounts that plain float64 rounds away.
+    class Shifted(AffineLoop):
+        def step(self, k, x, w):
+            return (x * 0.75 + 2.0**40) - (x * 0.5 + 2.0**40) + x * 0.7 + w
+
+    x, zero = torch.tensor([1 / 3, -0.7], dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    tube = propagator.propagate(Shifted(), Box(x, x), Box(zero, zero))
+    for i, exact in enumerate(map(Fraction, x.tolist())):
+        for k in range(9):
+            assert Fraction(float(tube.lower[k, i])) <= exact <= Fraction(float(tube.upper[k, i]))
+            exact = exact * Fraction(0.75) - exact * Fraction(0.5) + exact * Fraction(0.7)
+
+
+def test_chunks_of_rows_change_nothing():
+    loop = unicycle_loop(line(0.3))
+    whole, chunks = (Crown(rows=rows).propagate(loop, START, DISTURBANCE) for rows in (8192, 17))
+    torch.testing.assert_close(whole.lower, chunks.lower, rtol=0, atol=1e-12)
+
+
+def test_wrong_options_are_refused_in_one_line():
+    with pytest.raises(ConfigError, match="propagator.rows must be a positive integer, found 0"):
+        Crown(rows=0)
+    with pytest.raises(ConfigError, match="propagator.symbols must be a positive integer or null, found 0"):
+        Crown(symbols=0)

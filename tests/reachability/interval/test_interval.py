@@ -1,0 +1,76 @@
+"""Interval values: each operation encloses, exactly where it can, and monotonically."""
+
+import math
+
+import pytest
+import torch
+
+from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.interval.interval import Interval
+from sagemp_cli.sets import Box
+
+from ..propagator_cases import DISTURBANCE, START, line, unicycle_loop
+
+
+def interval(lower, upper) -> IntervalForm:
+    return IntervalForm(torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64))
+
+
+OPERATIONS = {
+    "sum": lambda a, b: a + b,
+    "difference": lambda a, b: 2.0 - a - b,
+    "product": lambda a, b: a * b,
+    "quotient": lambda a, b: a / (b + 4.0),
+    "quotient of a number": lambda a, b: 1.0 / (a + 4.0) + 0 * b,
+    "square": lambda a, b: a * a - b**2,
+    "layer": lambda a, b: torch.nn.functional.linear(
+        torch.stack([a, b], -1), torch.tensor([[0.3, -2.0], [1.0, 0.7]]).double(), torch.tensor([0.1, -5.0]).double()
+    )[..., 1],
+    "matrix": lambda a, b: (torch.stack([a, b], -1) @ torch.tensor([[0.3], [-2.0]]).double()).sum(-1),
+    "larger": lambda a, b: torch.maximum(a, b) - torch.minimum(a, torch.tensor(0.2).double()),
+    "angle": lambda a, b: torch.atan2(a, b),
+    "clamp": lambda a, b: torch.clamp(a, -0.5, 0.25) + torch.abs(b) + torch.nn.functional.leaky_relu(a, 0.1),
+    "waves": lambda a, b: torch.sin(3 * a) * torch.cos(b) + torch.tanh(a - b),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_operation_encloses_all_values_and_grows_with_the_set(name):
+    f = OPERATIONS[name]
+    generator = torch.Generator().manual_seed(0)
+    center = 2 * torch.rand(2, 50, dtype=torch.float64, generator=generator) - 1
+    radius = torch.rand(2, 50, dtype=torch.float64, generator=generator)
+    t = 2 * torch.rand(400, 2, 50, dtype=torch.float64, generator=generator) - 1
+    t[:100] = torch.sign(t[:100])
+    points = center + t * radius
+    values = f(points[:, 0], points[:, 1])
+    a, b = (IntervalForm(c - r - 1e-15, c + r + 1e-15) for c, r in zip(center, radius, strict=True))
+    lower, upper = f(a, b).bounds()
+    assert bool((lower <= values).all()) and bool((values <= upper).all())
+    wider = f(*(IntervalForm(v.lower - 0.1, v.upper + 0.1) for v in (a, b)))
+    assert bool((wider.lower <= lower).all()) and bool((wider.upper >= upper).all())
+
+
+def test_a_quotient_by_a_set_with_zero_is_unbounded_and_nothing_is_ever_nan():
+    quotient = interval([1.0, 1.0], [2.0, 2.0]) / interval([-1.0, 1.0], [1.0, 2.0])
+    assert quotient.lower.tolist()[0] == -math.inf and quotient.upper.tolist()[0] == math.inf
+    assert math.isfinite(quotient.lower.tolist()[1])
+    unknown = interval([-math.inf], [math.inf])
+    for value in (unknown - unknown, 0.0 * unknown, unknown / unknown, torch.exp(unknown), torch.sin(unknown)):
+        assert not bool(torch.isnan(value.lower).any() | torch.isnan(value.upper).any())
+    assert torch.sin(unknown).bounds() == (-1, 1)
+
+
+def test_ends_are_rounded_outwards():
+    total = interval([0.1], [0.1]) + 0.2
+    assert float(total.lower) < float(total.upper)
+    assert 0.1 + 0.2 in (math.nextafter(float(total.lower), 1), math.nextafter(float(total.upper), 0))
+
+
+def test_a_cell_inside_the_start_box_has_a_tube_inside():
+    loop = unicycle_loop(line(0.3))
+    outer = Interval().propagate(loop, START, DISTURBANCE)
+    cells = START.split([2, 2, 1, 1])
+    inner = Interval().propagate(loop, cells, DISTURBANCE)
+    assert bool((inner.lower >= outer.lower).all()) and bool((inner.upper <= outer.upper).all())
+    assert isinstance(START, Box)
