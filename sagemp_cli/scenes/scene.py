@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.scenes.objects import OBJECTS
-from sagemp_cli.sets import Box, round_down
+from sagemp_cli.sets import Box, round_down, round_up
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,16 @@ class Ball:
             total = round_down(total + square[..., i]).clamp(min=0.0)
         return round_down(round_down(torch.sqrt(total)).clamp(min=0.0) - self.radius)
 
+    def occupies(self, box: Box) -> Tensor:
+        """Whether the ball certainly holds all of boxes ``(..., d)``: their farthest corners, rounded outwards."""
+        c = torch.tensor(self.center, dtype=torch.float64)
+        far = round_up(torch.maximum((box.lower - c).abs(), (box.upper - c).abs()))
+        square = round_up(far * far)
+        total = square[..., 0]
+        for i in range(1, square.shape[-1]):
+            total = round_up(total + square[..., i])
+        return total <= round_down(torch.tensor(self.radius, dtype=torch.float64).square())
+
 
 @dataclass(frozen=True)
 class Block:
@@ -65,6 +75,11 @@ class Block:
         """A lower bound on the largest per-axis gap between boxes and the block, rounded down; <= 0 may touch."""
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (self.lower, self.upper))
         return round_down(torch.maximum(low - box.upper, box.lower - high).amax(-1))
+
+    def occupies(self, box: Box) -> Tensor:
+        """Whether the block holds the whole of boxes ``(..., d)``, exactly."""
+        low, high = (torch.tensor(v, dtype=torch.float64) for v in (self.lower, self.upper))
+        return ((low <= box.lower) & (box.upper <= high)).all(-1)
 
 
 Obstacle = Ball | Block

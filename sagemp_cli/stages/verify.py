@@ -21,7 +21,7 @@ from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.storage import Artifact, Certificate, Counterexample, Parent
 from sagemp_cli.verification.attack.falsifier import Counterexample as Found
-from sagemp_cli.verification.attack.refutation import attack
+from sagemp_cli.verification.attack.refutation import attack, decided
 from sagemp_cli.verification.verdict import answer_of
 
 _KEYS = ("partitions", "budget", "memory", "references", "file", "falsifier", "true_model")
@@ -61,11 +61,18 @@ def run(context: StageContext) -> Path:
         progress=context.progress,
         **(section["falsifier"] or {}),
     )
+    for r, example in refutation.unproved:
+        context.progress.say(
+            f"reference {r}: a rollout breaks '{decided(example, problem.dynamics)}' by {example.depth:.3g} in "
+            "float64, which rigorous arithmetic does not prove: it may be rounding, so nothing is refuted"
+        )
     record = Certificate(
         tubes=tubes_record(refutation.verification),
         tracker=tracker_file.record.weights,
         tracker_arguments=tracker_file.record.arguments,
-        counterexamples=tuple(_counterexample(r, found) for r, found in refutation.counterexamples),
+        counterexamples=tuple(
+            _counterexample(r, found, decided(found, problem.dynamics)) for r, found in refutation.counterexamples
+        ),
         falsifier_rollouts=refutation.rollouts,
         verdict=str(answer_of(refutation.verification.verdicts)),
         dynamics=robot_files[0].record.weights if robot_files else None,
@@ -88,13 +95,13 @@ def complaints(config: Mapping[str, Any]) -> list[str]:
     return [*key_complaints(section, "verify", _KEYS), *number_complaints(section, "verify", references=1), *wrong]
 
 
-def _counterexample(reference: int, found: Found) -> Counterexample:
+def _counterexample(reference: int, found: Found, constraint: str) -> Counterexample:
     """As stored; an obstacle is a 'collision' there."""
     return Counterexample(
         reference=reference,
         kind="collision" if found.kind == "obstacle" else found.kind,
         step=found.step,
-        constraint=found.name,
+        constraint=constraint,
         depth=found.depth,
         states=found.states.numpy(),
         disturbances=found.disturbances.numpy(),

@@ -173,5 +173,7 @@ def test_an_attack_refutes_what_is_unsafe_and_certified_references_withstand(lib
 
 def test_a_certified_reference_that_is_refuted_is_an_internal_error(library, cart, tracker):
     narrow = Scene(SCENE.workspace, SCENE.obstacles, Box([1.9, -0.01], [2.0, 0.01]))
-    with pytest.raises(SoundnessError, match="certified by 'affine', but a replayed rollout breaks 'goal' at step 20"):
+    with pytest.raises(
+        SoundnessError, match="certified by 'affine', but a replayed rollout breaks 'goal px' at step 20"
+    ):
         attack(library, cart, tracker=tracker, scene=narrow, generator=torch.Generator().manual_seed(0))

@@ -153,3 +153,13 @@ def test_every_scene_file_is_a_scene_that_its_readme_lists(path):
     dims = len(data["workspace"]["lower"])
     scene_from_mapping(data, state_dim=len(data["goal"]["lower"]), position_dim=dims)
     assert f"| `{path.stem}` |" in (Path(path).parent / "README.md").read_text(encoding="utf-8")
+
+
+def test_an_obstacle_occupies_a_box_only_if_it_holds_every_corner():
+    ball, block = Ball((0.0, 0.0), 1.0), Block((-1.0, -1.0), (1.0, 1.0))
+    inside, out = Box.around([0.0, 0.0], [0.7, 0.7]), Box.around([0.0, 0.0], [0.71, 0.71])
+    assert bool(ball.occupies(inside)) and not bool(ball.occupies(out))
+    assert bool(block.occupies(out)) and not bool(block.occupies(Box.around([0.5, 0.0], [0.51, 0.1])))
+    touching = Box(torch.tensor([1.0, 0.0]), torch.tensor([1.0, 0.0]))
+    assert bool(block.occupies(touching))
+    assert not bool(ball.occupies(Box.around([0.6, 0.8], [0.0, 0.0])))  # on the surface: rounding decides nothing

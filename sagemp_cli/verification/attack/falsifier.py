@@ -1,4 +1,8 @@
-"""Searches for a rollout that leaves the safe set or misses the goal; what it returns has been replayed."""
+"""Searches for a rollout that leaves the safe set or misses the goal.
+
+The search is in float64; what it finds is replayed in rigorous arithmetic
+(:mod:`sagemp_cli.verification.attack.rigorous_replay`), and says whether that proved it.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +18,24 @@ from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.attack.ascent import ascend, first_units, simulate
-
-REPLAY_MARGIN = 1e-9
-"""How deep, in units of the state, a replayed violation must be: far above what rounding adds to a rollout."""
+from sagemp_cli.verification.attack.rigorous_replay import inner, violations
 
 
 @dataclass(frozen=True)
 class Counterexample:
-    """A rollout that was replayed and breaks the claim.
+    """A rollout that breaks the claim, in float64 at least.
 
     Attributes:
         start: ``(n,)``, inside the start box.
         disturbances: ``(K, d)``, each inside the disturbance box.
-        states: the replayed states ``(K+1, n)``.
+        states: the replayed states ``(K+1, n)``, in float64.
         kind: ``"workspace"``, ``"obstacle"`` or ``"goal"``.
         name: the obstacle's name, or the kind again.
         step: the first step at which the constraint is broken (K for the goal).
         depth: how far it is broken at worst, metres in the scene, units of the state in the goal.
+        state: of a missed goal the state that misses most, else -1.
+        proved: whether rigorous arithmetic proves that the constraint is broken at ``step``. If not, the violation may
+            be one of rounding only, and nothing is refuted.
     """
 
     start: Tensor
@@ -40,6 +45,8 @@ class Counterexample:
     name: str
     step: int
     depth: float
+    state: int = -1
+    proved: bool = False
 
 
 def margins(states: Tensor, scene: Scene, position: tuple[int, ...]) -> Tensor:
@@ -57,26 +64,47 @@ def margins(states: Tensor, scene: Scene, position: tuple[int, ...]) -> Tensor:
 
 
 def replay(
-    loop: Loop, start: Tensor, disturbances: Tensor, *, scene: Scene, position: tuple[int, ...]
+    loop: Loop,
+    start: Tensor,
+    disturbances: Tensor,
+    *,
+    boxes: tuple[Box, Box],
+    scene: Scene,
+    position: tuple[int, ...],
 ) -> Counterexample | None:
-    """The counterexample that a start ``(n,)`` and disturbances ``(K, d)`` make, simulated alone, or None.
+    """The counterexample that a start ``(n,)`` and disturbances ``(K, d)`` make alone, or None if float64 shows none.
 
-    Violations of at most :data:`REPLAY_MARGIN` do not count, nor does a rollout that overflows.
+    Both are first moved into what the boxes hold whatever their corners were rounded from. A rollout that overflows
+    is no counterexample.
+
+    Args:
+        loop: what steps.
+        start, disturbances: the rollout.
+        boxes: X_I and W, which they come from.
+        scene: workspace, obstacles and goal.
+        position: indices of the state that are the position in the scene.
     """
+    start, disturbances = (_into(inner(box), point) for box, point in zip(boxes, (start, disturbances), strict=True))
     with torch.no_grad():
         states = simulate(loop, start, disturbances)
         found = margins(states, scene, position)
-    if not bool(torch.isfinite(states).all()):
+    if not bool(torch.isfinite(states).all()) or not bool((found < 0).any()):
         return None
-    constraint = int(found.amin(0).argmin())
-    along = found[:, constraint]
-    broken = along < -REPLAY_MARGIN
-    if not bool(broken.any()):
-        return None
+    proved = violations(loop, start, disturbances, boxes=boxes, scene=scene, position=position)
+    certain = bool(proved.any())
+    # Of what is proved (of what float64 shows, if nothing is) the constraint that is broken most.
+    broken = proved if certain else found < 0
+    constraint = int(torch.where(broken, found, torch.inf).amin(0).argmin())
     names = (*scene.constraint_names, "goal")
     kind = {0: "workspace", len(names) - 1: "goal"}.get(constraint, "obstacle")
-    step, depth = int(broken.int().argmax()), -float(along.min())
-    return Counterexample(start, disturbances, states, kind, names[constraint], step, depth)
+    step, depth = int(broken[:, constraint].int().argmax()), -float(found[:, constraint].min())
+    worst = int(torch.minimum(states[-1] - scene.goal.lower, scene.goal.upper - states[-1]).argmin())
+    state = worst if kind == "goal" else -1
+    return Counterexample(start, disturbances, states, kind, names[constraint], step, depth, state, certain)
+
+
+def _into(box: Box, point: Tensor) -> Tensor:
+    return torch.minimum(torch.maximum(point, box.lower), box.upper)
 
 
 def falsify(
@@ -90,7 +118,7 @@ def falsify(
     restarts: int = 8,
     rates: tuple[float, ...] = (2.0, 1.0, 0.5, 0.5, 0.25, 0.25, 0.1, 0.1),
 ) -> list[Counterexample | None]:
-    """One counterexample, or None, for each reference.
+    """One counterexample, or None, for each reference; where none is proved, the deepest that float64 shows.
 
     Every constraint (workspace, each obstacle, goal) is attacked by ``restarts`` ascents of its own, all in one
     batch with all references, from the middle, random points and bang-bang disturbances. None proves nothing.
@@ -142,16 +170,20 @@ def falsify(
     ):
         least = torch.nan_to_num(margins(trial.states, scene, position).flatten(-2).amin(-1), nan=torch.inf)
         value, row = least.min(-1)
-        for r in torch.nonzero(value < worst.clamp(max=-REPLAY_MARGIN))[:, 0].tolist():
+        for r in torch.nonzero(value < worst.clamp(max=0.0))[:, 0].tolist():
             example = replay(
                 singles[r],
                 trial.start[r, row[r]].clone(),
                 trial.disturbances[r, row[r]].clone(),
+                boxes=(Box(boxes.lower[r, 0], boxes.upper[r, 0]), disturbance),
                 scene=scene,
                 position=position,
             )
-            if example is not None:
+            if example is None:
+                continue
+            before = found[r]
+            if before is None or example.proved or not before.proved:
                 found[r], worst[r] = example, value[r]
-        if all(example is not None for example in found):
+        if all(example is not None and example.proved for example in found):
             break
     return found

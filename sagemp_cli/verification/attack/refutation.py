@@ -31,13 +31,15 @@ class Refutation:
 
     Attributes:
         verification: the same with verdict UNSAFE for each refuted reference.
-        counterexamples: index of the reference and the replayed rollout.
+        counterexamples: index of the reference and the rollout, which rigorous arithmetic proves to break the claim.
         rollouts: simulated altogether.
+        unproved: index of a reference that stays as it was and a rollout that breaks the claim in float64 only.
     """
 
     verification: Verification
     counterexamples: tuple[tuple[int, Counterexample], ...]
     rollouts: int
+    unproved: tuple[tuple[int, Counterexample], ...] = ()
 
 
 def attack(
@@ -69,7 +71,7 @@ def attack(
     Raises:
         SoundnessError: a certified reference was refuted.
     """
-    verdicts, found, rollouts = list(verification.verdicts), [], 0
+    verdicts, found, unproved, rollouts = list(verification.verdicts), [], [], 0
     attacks = len(scene.constraint_names) + 1
     with (progress or Silent()).task("searching for counterexamples", len(verdicts)) as task:
         for safe, starts, rates in ((False, restarts, RATES), (True, safe_restarts, SHORT_RATES)):
@@ -89,15 +91,25 @@ def attack(
                     )
                     rollouts += starts * attacks * (len(rates) + 1) * len(some)
                     for r, example in zip(some, examples, strict=True):
-                        if example is None:
+                        if example is None or (safe and not example.proved):
                             continue
+                        if not example.proved:
+                            unproved.append((r, example))
+                            continue
+                        name = decided(example, dynamics)
                         if safe:
                             raise SoundnessError(
                                 f"reference {r} was certified by '{verification.propagator}', but a replayed rollout "
-                                f"breaks '{example.name}' at step {example.step} by {example.depth:.3g}; "
+                                f"breaks '{name}' at step {example.step} by {example.depth:.3g}; "
                                 "please report this"
                             )
                         found.append((r, example))
-                        verdicts[r] = Verdict(Outcome.UNSAFE, example.step, example.name)
+                        verdicts[r] = Verdict(Outcome.UNSAFE, example.step, name)
                 task.advance(len(some))
-    return Refutation(dataclasses.replace(verification, verdicts=tuple(verdicts)), tuple(found), rollouts)
+    refuted = dataclasses.replace(verification, verdicts=tuple(verdicts))
+    return Refutation(refuted, tuple(found), rollouts, tuple(unproved))
+
+
+def decided(example: Counterexample, dynamics: Dynamics) -> str:
+    """What a counterexample breaks, in words: an obstacle, the workspace, or ``goal <state>``."""
+    return f"goal {dynamics.state_names[example.state]}" if example.kind == "goal" else example.name

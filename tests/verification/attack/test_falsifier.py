@@ -1,6 +1,8 @@
 """The falsifier finds planted violations, replays them, and stays silent on safe loops."""
 
+import math
 from dataclasses import dataclass
+from fractions import Fraction
 
 import pytest
 import torch
@@ -13,7 +15,8 @@ from sagemp_cli.scenes.scene import Ball, Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
 from sagemp_cli.verification.attack.ascent import simulate
-from sagemp_cli.verification.attack.falsifier import falsify, margins, replay
+from sagemp_cli.verification.attack.falsifier import falsify, replay
+from sagemp_cli.verification.attack.rigorous_replay import inner, violations
 
 INF = float("inf")
 
@@ -46,7 +49,7 @@ def search(where: Scene, loop=None, start=START, **options):
 def test_a_violation_that_only_the_worst_disturbance_reaches_is_found_and_replays():
     # At k = 10 the reach set's upper face in y is at 0.3; the ball's lowest point is at 0.295.
     [found] = search(scene(Ball((1.0, 0.795), 0.5, "planted")))
-    assert found is not None
+    assert found is not None and found.proved
     assert (found.kind, found.name, found.step) == ("obstacle", "planted", 10)
     assert 0 < found.depth <= 0.0051
     assert bool(START.contains(found.start)) and bool(DISTURBANCE.contains(found.disturbances).all())
@@ -71,13 +74,135 @@ def test_leaving_the_workspace_names_the_first_step_outside():
     assert float(found.states[found.step].abs().max()) > 0.5
 
 
-def test_a_violation_within_rounding_does_not_count():
-    x = torch.tensor([0.5 + 1e-12, 0.0], dtype=torch.float64)
-    still = torch.tensor([-0.1, 0.0], dtype=torch.float64).expand(10, 2)
-    where = scene(half=0.5)
-    assert float(margins(x[None], where, (0, 1))[0, 0]) < 0
-    assert replay(Drift(), x, still, scene=where, position=(0, 1)) is None
-    assert replay(Drift(), x + 1e-6, still, scene=where, position=(0, 1)) is not None
+@dataclass(frozen=True)
+class Along:
+    """``x+ = x + step``: in real arithmetic ``x_0 + K step``, of which float64 makes what it can."""
+
+    by: float = 0.1
+    horizon: int = 100
+    state_dim: int = 2
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return x + torch.tensor([self.by, 0.0], dtype=torch.float64) + w
+
+
+def goal_from(lower: float) -> Scene:
+    """A goal that is reached from this coordinate on."""
+    endless = Box(torch.full((2,), -INF), torch.full((2,), INF))
+    return Scene(endless, (), Box(torch.tensor([lower, -INF], dtype=torch.float64), torch.full((2,), INF)))
+
+
+def end_in_float64(at: float, by: float, horizon: int) -> float:
+    x = at
+    for _ in range(horizon):
+        x += by
+    return x
+
+
+@pytest.mark.parametrize("at", [5e5, 5e6])
+@pytest.mark.parametrize("by", [0.1, 0.3, 0.7])
+def test_a_goal_that_real_arithmetic_reaches_is_not_called_missed_though_float64_misses_it(at, by):
+    loop = Along(by)
+    real = Fraction(at) + loop.horizon * Fraction(by)
+    lower = math.nextafter(float(real), -INF)
+    assert Fraction(lower) < real - Fraction(1, 10**12)  # X_I is 2e-12 wide: the goal is reached from all of it
+    start, still = Box.around([at, 0.0], [1e-12, 0.0]), Box.around([0.0, 0.0], [0.0, 0.0])
+    [found] = falsify(
+        loop, start, still, scene=goal_from(lower), position=(0, 1), generator=torch.Generator().manual_seed(0)
+    )
+    assert found is None or not found.proved
+    assert (found is not None) == (min(end_in_float64(x, by, loop.horizon) for x in boundary(start)) < lower)
+
+
+def boundary(start: Box) -> list[float]:
+    return [float(start.lower[0]), float(start.center[0]), float(start.upper[0])]
+
+
+def test_some_of_these_goals_are_missed_in_float64_by_more_than_a_nanometre():
+    """So the test above tests something, and no absolute margin would do."""
+    missed = [
+        float(Fraction(at) + 100 * Fraction(by)) - end_in_float64(at, by, 100)
+        for at in (5e5, 5e6)
+        for by in (0.1, 0.3, 0.7)
+    ]
+    assert max(missed) > 1e-9
+
+
+@pytest.mark.parametrize("at", [0.0, 5e5, 5e6])
+def test_a_goal_that_is_missed_by_more_than_rounding_is_proved_missed(at):
+    loop, still = Along(), Box.around([0.0, 0.0], [0.0, 0.0])
+    real = Fraction(at) + loop.horizon * Fraction(loop.by)
+    lower = float(real) + 1e-14 * max(at, 1.0) * 100
+    [found] = falsify(
+        loop,
+        Box.around([at, 0.0], [1e-12, 0.0]),
+        still,
+        scene=goal_from(lower),
+        position=(0, 1),
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert found is not None and found.proved and (found.kind, found.state, found.step) == ("goal", 0, 100)
+
+
+def test_a_goal_missed_by_1e_15_is_refuted_only_if_real_arithmetic_misses_it():
+    """The real end of 50 steps of 0.01 from 0.1 lies between two floats; goals begin just below and just above it."""
+    loop, still = Along(0.01, 50), Box.around([0.0, 0.0], [0.0, 0.0])
+    real = Fraction(0.1) + 50 * Fraction(0.01)
+    verdicts = {}
+    for ulps in (-1000, -20, -9, -3, -1, 0, 1, 3, 9, 20, 1000):  # 9 of them are 1e-15
+        lower = 0.6 + ulps * 2.0**-53
+        [found] = falsify(
+            loop,
+            Box.around([0.1, 0.0], [0.0, 1e-3]),
+            still,
+            scene=goal_from(lower),
+            position=(0, 1),
+            generator=torch.Generator().manual_seed(0),
+            restarts=1,
+        )
+        verdicts[ulps] = found is not None and found.proved
+        assert not verdicts[ulps] or real < Fraction(lower)
+    assert verdicts[1000] and not verdicts[-1000]
+
+
+def test_what_is_proved_starts_inside_the_real_box_and_not_in_the_float_outside_of_it():
+    start = Box.around([0.1, 0.0], [0.05, 0.0])
+    kept = inner(start)
+    assert Fraction(float(kept.lower[0])) >= Fraction(0.1) - Fraction(0.05)
+    assert Fraction(float(kept.upper[0])) <= Fraction(0.1) + Fraction(0.05)
+    assert torch.equal(kept.lower[1], start.lower[1]) and torch.equal(kept.upper[1], start.upper[1])
+    # Only from the outermost floats, which rounding outwards added, is the goal missed.
+    real = Fraction(0.1) - Fraction(0.05)
+    loop = Along(0.5, 1)
+    lower = math.nextafter(float(real + Fraction(1, 2)), 0.0)
+    assert Fraction(lower) <= real + Fraction(1, 2)
+    [found] = falsify(
+        loop,
+        start,
+        Box.around([0.0, 0.0], [0.0, 0.0]),
+        scene=goal_from(lower),
+        position=(0, 1),
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert found is None or not found.proved
+
+
+def test_a_disturbance_set_too_narrow_to_know_its_points_proves_nothing():
+    where, x, w = goal_from(1e9), torch.zeros(2, dtype=torch.float64), torch.zeros(100, 2, dtype=torch.float64)
+    narrow = Box.around([5e6, 0.0], [1e-12, 0.0])
+    boxes = (Box.around([0.0, 0.0], [0.1, 0.1]), narrow)
+    assert not bool(violations(Along(), x, w + narrow.center, boxes=boxes, scene=where, position=(0, 1)).any())
+    boxes = (boxes[0], Box.around([0.0, 0.0], [0.1, 0.1]))
+    assert bool(violations(Along(), x, w, boxes=boxes, scene=where, position=(0, 1))[-1, -1])
+
+
+def test_a_rollout_that_breaks_nothing_is_no_counterexample():
+    boxes = (START, DISTURBANCE)
+    still = torch.zeros(10, 2, dtype=torch.float64)
+    x = torch.zeros(2, dtype=torch.float64)
+    assert replay(Drift(), x, still, boxes=boxes, scene=scene(), position=(0, 1)) is None
+    found = replay(Drift(), x, still, boxes=boxes, scene=scene(half=0.45), position=(0, 1))
+    assert found is not None and found.proved and (found.kind, found.step) == ("workspace", 5)
 
 
 def test_an_overflowing_rollout_is_no_counterexample():
