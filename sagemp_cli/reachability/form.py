@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.functions import on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
@@ -41,11 +42,21 @@ class Operation(NamedTuple):
         """The band, of arrays and as arrays."""
         if self.arrays:
             return self.band(lower, upper, *parameters)
-        return on_tensors(lambda low, high: self.band(low, high, *parameters), lower, upper)
+        given = [p for p in parameters if isinstance(p, np.ndarray)]
+        rest = parameters[len(given) :]
+        return on_tensors(lambda low, high, *arrays: self.band(low, high, *arrays, *rest), lower, upper, *given)
+
+
+ANGLE = Operation(_arctangent2.band, _arctangent2.lines, _arctangent2.value_range)
+"""``atan2``, the one function of two operands; its range is of these."""
 
 
 class Form:
-    """A set of values of one shape. Final types have ``shape`` and ``dim()`` as tensors do, batch first."""
+    """A set of values of one shape. Final types have ``shape`` and ``dim()`` as tensors do, batch first.
+
+    There are no bounds to be asked for here, so that what is made of other functions cannot choose them by bounds: a
+    step is the same operations whatever the sets, and what is known of an operation in one pass holds in the next.
+    """
 
     __slots__ = ()
 
@@ -56,12 +67,8 @@ class Form:
         """What encloses ``f(self)``, entry by entry."""
         raise NotImplementedError
 
-    def widened(self, name: str, band: Band) -> Form:
-        """What encloses ``slope * self + offset + [-radius, radius]``."""
-        raise NotImplementedError
-
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper bound of every entry."""
+    def angle(self, x: Any) -> Form:
+        """What encloses ``atan2(self, x)``, entry by entry; x is of the same type and shape."""
         raise NotImplementedError
 
     def _call(self, function: Any, *args: Any) -> Any:

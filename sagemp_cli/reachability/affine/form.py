@@ -25,8 +25,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import UnsupportedOperationError
-from sagemp_cli.reachability.form import Form, Operation
+from sagemp_cli.errors import UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.form import ANGLE, Form, Operation
+from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
+from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.sets.rounding import TINY, UNIT
 
@@ -47,6 +49,8 @@ class Relaxed(NamedTuple):
         operation, parameters: how to get lines for those bounds; None for a product and where there is nothing but the
             band.
         factors: of a product.
+        given: what else the lines depend on, after the bounds: tensors in the input's shape.
+        turn: of an angle, the direction across which its input is (:mod:`.relaxations.arctangent2`).
     """
 
     name: str
@@ -62,6 +66,8 @@ class Relaxed(NamedTuple):
     operation: Operation | None = None
     parameters: tuple[Any, ...] = ()
     factors: Factors | None = None
+    given: tuple[Tensor, ...] = ()
+    turn: Turn | None = None
 
 
 class Factors(NamedTuple):
@@ -109,8 +115,57 @@ class Factors(NamedTuple):
         return self.magnitude_x * self.scale + self.magnitude_y / self.scale
 
 
-Hints = Sequence[tuple[Tensor, Tensor] | None]
-"""Bounds known from elsewhere of each operation's input, in the order of evaluation."""
+class Hint(NamedTuple):
+    """What is known from an earlier pass of one operation's input.
+
+    Attributes:
+        name, size: of the operation that it is known of, and of one cell's entries.
+        lower, upper: bounds of the input; None if there are none.
+        turn: of an angle, the direction across which its input was.
+    """
+
+    name: str
+    size: int
+    lower: Tensor | None = None
+    upper: Tensor | None = None
+    turn: Turn | None = None
+
+    def intersected(self, other: Hint) -> Hint:
+        """What holds if both hold; the other one, if they are not of the same input."""
+        same_turn = all(map(torch.equal, self.turn or (), other.turn or ())) and (not self.turn) == (not other.turn)
+        if self.lower is None or self[:2] != other[:2] or not same_turn:
+            return other
+        if other.lower is None:
+            return self
+        return self._replace(lower=torch.maximum(self.lower, other.lower), upper=torch.minimum(self.upper, other.upper))
+
+
+Hints = Sequence[Hint]
+"""What is known of every operation of a step, in the order of evaluation."""
+
+
+def hint_of(hints: Hints | None, name: str, size: int, before: Sequence[tuple[str, int]]) -> Hint | None:
+    """What is known of the operation that comes after these.
+
+    Raises:
+        UsageError: the step does other operations than when the hints were found: they may be bounds of other values.
+    """
+    if hints is None:
+        return None
+    now, then = [*before, (name, size)], [(h.name, h.size) for h in hints[: len(before) + 1]]
+    if now != then:
+        found, was = (", ".join(f"{n} of {s}" for n, s in names) for names in (now, then))
+        raise UsageError(
+            f"the loop's step does not always do the same operations: {found}, where it did {was} in an earlier pass"
+        )
+    return hints[len(before)]
+
+
+def narrowed(lower: Tensor, upper: Tensor, hint: Hint | None) -> tuple[Tensor, Tensor]:
+    """Bounds of an operation's input, intersected with what is known of it."""
+    if hint is None or hint.lower is None or hint.upper is None:
+        return lower, upper
+    return torch.maximum(lower, hint.lower), torch.minimum(upper, hint.upper)
 
 
 class StepFrame:
@@ -122,7 +177,7 @@ class StepFrame:
         disturbance_radius: of the disturbance variables, ``(d,)``.
         size: number of variables so far.
         relaxations: the nonlinear operations of this step, in the order of evaluation.
-        hints: bounds of their inputs, intersected with what the forms give.
+        hints: what is known of them; bounds of their inputs are intersected with what the forms give.
         ellipsoid: after :meth:`condense`, the shape matrix of the symbols, scaled to the extent of the set's box,
             ``(*batch, n, n)``; no enclosure, but enough where a guess is.
     """
@@ -147,10 +202,17 @@ class StepFrame:
         """Names and bands of the operations, in the order of evaluation."""
         return [(r.name, r.band) for r in self.relaxations]
 
-    def narrowed(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """The bounds of the next operation's input, intersected with what is known of it."""
-        hint = None if self.hints is None else self.hints[len(self.relaxations)]
-        return (lower, upper) if hint is None else (torch.maximum(lower, hint[0]), torch.minimum(upper, hint[1]))
+    def hint(self, name: str, shape: torch.Size) -> Hint | None:
+        """What is known of the next operation."""
+        if self.hints is None:
+            return None
+        return hint_of(
+            self.hints, name, self.entries(shape), [(r.name, self.entries(r.center.shape)) for r in self.relaxations]
+        )
+
+    def entries(self, shape: torch.Size) -> int:
+        """Entries of one cell."""
+        return math.prod(shape[len(self.batch) :])
 
     @property
     def sum_error(self) -> float:
@@ -287,21 +349,35 @@ class AffineForm(Form):
 
     def relaxed(self, name: str, operation: Operation, *parameters: Any) -> AffineForm:
         """The form of ``f(self)``: f's band over :meth:`bounds`."""
-        lower, upper = self.frame.narrowed(*self.bounds())
-        return self._within(name, operation.band(lower, upper, *parameters), lower, upper, operation, parameters)
+        lower, upper = narrowed(*self.bounds(), self.frame.hint(name, self.shape))
+        band = operation.band(lower, upper, *parameters)
+        return self.within(name, band, lower=lower, upper=upper, operation=operation, parameters=parameters)
 
-    def widened(self, name: str, band: Band) -> AffineForm:
-        """The form of ``slope * self + offset + [-radius, radius]``."""
-        return self._within(name, band)
+    def angle(self, x: AffineForm) -> AffineForm:
+        """The form of ``atan2(self, x)``: a function of how far the point is across the middle of its angles."""
+        hint = self.frame.hint("atan2", self.shape)
+        low, high = ANGLE.value_range(*self.bounds(), *x.bounds())
+        turn = _arctangent2.turn(low, high) if hint is None or hint.turn is None else hint.turn
+        across, along = self * turn.cosine - x * turn.sine, x * turn.cosine + self * turn.sine
+        lower, upper = narrowed(*across.bounds(), hint)
+        radius = along.radius()
+        scale = torch.sqrt(radius / across.radius()).detach()
+        x, y = across * scale, along / scale
+        ends = [form.radius() + form.slack() for form in (x + y, x - y)]
+        twist = _arctangent2.twist(across.center, radius, *ends)
+        given = (*along.bounds(), along.center, *twist, turn.angle, low, high)
+        band = ANGLE.band(lower, upper, *given)
+        return across.within("atan2", band, lower=lower, upper=upper, operation=ANGLE, given=given, turn=turn)
 
-    def _within(self, name: str, band: Band, *made_of: Any) -> AffineForm:
+    def within(self, name: str, band: Band, **made_of: Any) -> AffineForm:
+        """The form of ``slope * self + offset + [-radius, radius]``; ``made_of`` are attributes of :class:`Relaxed`."""
         frame = self.frame
         slope, offset, radius = band
         magnitude = slope.abs() * self.magnitude + offset.abs() + (radius + TINY)
         radius = radius * SAFETY + magnitude * ((self.error + 4 * UNIT) * SAFETY)
         frame.relaxations.append(
             Relaxed(
-                name, band, radius, frame.size, self.center, self.coefficients, self.magnitude, self.error, *made_of
+                name, band, radius, frame.size, self.center, self.coefficients, self.magnitude, self.error, **made_of
             )
         )
         return self.with_fresh(self.center * slope + offset, self.coefficients * slope, magnitude, radius)

@@ -376,7 +376,8 @@ def _lines(group: list[Relaxed], shape: torch.Size) -> Iterator[Tensor]:
     """The operation's lines in all steps, found in one call."""
     r = group[0]
     lower, upper = torch.stack([q.lower for q in group]), torch.stack([q.upper for q in group])
-    return (part.reshape(shape) for part in r.operation.lines(lower, upper, *r.parameters))
+    given = (torch.stack(parts) for parts in zip(*(q.given for q in group), strict=True))
+    return (part.reshape(shape) for part in r.operation.lines(lower, upper, *given, *r.parameters))
 
 
 def _signed(carried: Tensor, magnitude: Tensor, coefficients: Tensor) -> Tensor:

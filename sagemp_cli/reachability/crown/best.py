@@ -61,10 +61,4 @@ class Best:
 
 def _sharper(old: list[Hints], new: list[Hints]) -> list[Hints]:
     """Both rounds' bounds hold."""
-    return [
-        [
-            a if b is None else b if a is None else (torch.maximum(a[0], b[0]), torch.minimum(a[1], b[1]))
-            for a, b in zip(*step, strict=True)
-        ]
-        for step in zip(old, new, strict=True)
-    ]
+    return [[a.intersected(b) for a, b in zip(*step, strict=True)] for step in zip(old, new, strict=True)]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine.affine import Affine, AffineRun
-from sagemp_cli.reachability.affine.form import Hints, Relaxed
+from sagemp_cli.reachability.affine.form import Hint, Hints, Relaxed, StepFrame
 from sagemp_cli.reachability.batch import batched_start
 from sagemp_cli.reachability.crown.backward import backward
 from sagemp_cli.reachability.crown.backward_steps import compiled
@@ -77,16 +77,17 @@ def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -
         lowers.append(lower)
         uppers.append(upper)
         for after, bounds in zip(some, found.inputs, strict=True):
-            hints.append([_hint(*pair) for pair in zip(after.frame.relaxations, bounds, strict=True)])
+            hints.append([_hint(after.frame, *pair) for pair in zip(after.frame.relaxations, bounds, strict=True)])
     return Tube(torch.cat(lowers, dim=-2), torch.cat(uppers, dim=-2)), hints
 
 
-def _hint(operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
-    """Bounds of an operation's input in its own shape."""
+def _hint(frame: StepFrame, operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> Hint:
+    """What is known of an operation, bounds of its input in its own shape."""
+    hint = Hint(operation.name, frame.entries(operation.center.shape), turn=operation.turn)
     if bounds is None:
-        return None
-    low, high = (side.reshape(operation.center.shape) for side in bounds)
-    return _placed(operation.center, low, high)
+        return hint
+    low, high = _placed(operation.center, *(side.reshape(operation.center.shape) for side in bounds))
+    return hint._replace(lower=low, upper=high)
 
 
 def _placed(center: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

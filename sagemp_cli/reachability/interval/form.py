@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
-from sagemp_cli.reachability.form import Form, Handler, Operation, registers
-from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
-from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.form import ANGLE, Form, Handler, Operation, registers
 from sagemp_cli.sets import round_down, round_up
 from sagemp_cli.sets.rounding import TINY, UNIT
 
@@ -53,11 +51,9 @@ class IntervalForm(Form):
         """The range of a function's values."""
         return IntervalForm(*operation.value_range(self.lower, self.upper, *parameters))
 
-    def widened(self, name: str, band: Band) -> IntervalForm:
-        """``slope * self + offset + [-radius, radius]``."""
-        return add(
-            multiply(self, band.slope), IntervalForm(*_outwards(band.offset - band.radius, band.offset + band.radius))
-        )
+    def angle(self, x: IntervalForm) -> IntervalForm:
+        """The range of the angles."""
+        return IntervalForm(*ANGLE.value_range(*self.bounds(), *x.bounds()))
 
     def __getitem__(self, index: Any) -> IntervalForm:
         return IntervalForm(self.lower[index], self.upper[index])
@@ -202,10 +198,3 @@ def minimum(a: Any, b: Any) -> IntervalForm:
     """The smaller one, exactly."""
     a, b = _interval(a), _interval(b)
     return IntervalForm(torch.minimum(a.lower, b.lower), torch.minimum(a.upper, b.upper))
-
-
-@handles(torch.atan2, torch.arctan2, torch.Tensor.atan2, torch.Tensor.arctan2)
-def arctangent2(y: Any, x: Any) -> IntervalForm:
-    """Angle of the point (x, y)."""
-    y, x = _interval(y), _interval(x)
-    return IntervalForm(*_arctangent2.value_range(*torch.broadcast_tensors(*y.bounds(), *x.bounds())))

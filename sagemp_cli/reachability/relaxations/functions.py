@@ -22,11 +22,14 @@ def functions_of(x: Any) -> Any:
 
 
 def on_tensors(function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function of tensors makes of tensors, or of arrays; it may give a named tuple."""
+    """What a function of tensors makes of tensors, or of arrays; it may give several."""
     if isinstance(arguments[0], Tensor):
         return function(*arguments)
     answer = function(*(torch.from_numpy(a) for a in arguments))
-    return answer.numpy() if isinstance(answer, Tensor) else type(answer)(*(part.numpy() for part in answer))
+    if isinstance(answer, Tensor):
+        return answer.numpy()
+    parts = tuple(part.numpy() for part in answer)
+    return parts if type(answer) is tuple else type(answer)(*parts)
 
 
 def constant(x: Any) -> Any:

@@ -13,7 +13,6 @@ from sagemp_cli.errors import UnsupportedOperationError
 from sagemp_cli.reachability.form import SHARED, Form, Operation, registers
 from sagemp_cli.reachability.relaxations import absolute as _absolute
 from sagemp_cli.reachability.relaxations import arctangent as _arctangent
-from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations import clamp as _clamp
 from sagemp_cli.reachability.relaxations import elu as _elu
 from sagemp_cli.reachability.relaxations import exponential as _exponential
@@ -189,15 +188,11 @@ def smaller(a: Form, b: Any = None, **options: Any) -> Form:
 @handles(torch.atan2, torch.arctan2, torch.Tensor.atan2, torch.Tensor.arctan2)
 def arctangent2(y: Any, x: Any) -> Form:
     """Angle of the point (x, y)."""
-    frame_of = y if isinstance(y, Form) else x
-    zero = 0.0 * frame_of
-    y, x = y + zero if isinstance(x, Form) else y, x + zero if isinstance(y, Form) else x
-    y, x = (v if isinstance(v, Form) else zero + v for v in (y, x))
-    form = _arctangent2.quadrant(*y.bounds(), *x.bounds())
-    known, upright = form.known.double(), form.upright.double()
-    sideways = known * (1.0 - upright)
-    quotient = (y * sideways + x * upright) / (x * sideways + y * upright + (1.0 - known))
-    return torch.atan(quotient).widened("atan2", form.turned)
+    zero = 0.0 * (y if isinstance(y, Form) else x)
+    y, x = (v if isinstance(v, Form) else zero + _tensor(v) for v in (y, x))
+    if y.shape != x.shape:
+        y, x = y + 0.0 * x, x + 0.0 * y
+    return y.angle(x)
 
 
 def _tensor(value: Any) -> Any:

@@ -101,9 +101,7 @@ def test_nonlinear_operations_are_noted_in_the_order_of_evaluation():
     assert [part.shape[-1] for part in found.split(found.state.matrix)] == [1, 3, 2, 2, 2, 1, 1, 2, 2, 2, 2]
 
 
-def test_what_depends_on_the_sets_cannot_be_folded():
-    with pytest.raises(NotFoldable):
-        plan(lambda p, x, w: torch.atan2(x, 2.0 + w))
+def test_what_is_no_state_cannot_be_folded():
     with pytest.raises(NotFoldable):
         plan(lambda p, x, w: x[..., 0])  # not a state
 

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.affine.form import Hint
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
 from sagemp_cli.sets import Box
@@ -43,7 +44,14 @@ def test_hints_that_are_too_tight_break_the_tube():
     loop = unicycle_loop(line(0.3), gain=0.8)
     run = Affine().run(loop, WIDE, DISTURBANCE, keep_steps=True)
     point = [
-        [None if r.lower is None else (0.5 * (r.lower + r.upper),) * 2 for r in after.frame.relaxations]
+        [
+            Hint(
+                r.name,
+                after.frame.entries(r.center.shape),
+                *(() if r.lower is None else (0.5 * (r.lower + r.upper),) * 2),
+            )
+            for r in after.frame.relaxations
+        ]
         for after in run.steps
     ]
     assert float(Affine().run(loop, WIDE, DISTURBANCE, hints=point).tube.width[-1].mean()) < float(
@@ -56,3 +64,36 @@ def test_wrong_options_are_refused_in_one_line():
         Best(rounds=0)
     with pytest.raises(ConfigError, match="propagator.rows must be a positive integer, found -1"):
         Best(rows=-1)
+
+
+class Angle:
+    """One step whose angle is written best as y / x over the first pass's bounds and as x / y over the second's."""
+
+    horizon, state_dim = 1, 1
+
+    def step(self, k, x, w):
+        return torch.atan2(1.5 + 0 * x, 1.2 + torch.log(x * x + 0.5)) + 0 * w
+
+
+def test_what_was_found_for_an_angle_is_used_for_that_angle_only():
+    start, w = Box.around([2.485], [1.165]), Box.around([0.0], [0.0])
+    tubes = [Best(rounds=n).propagate(Angle(), start, w) for n in (2, 3)]
+    values = Angle().step(0, torch.linspace(1.32, 3.65, 2001, dtype=torch.float64)[:, None], w.center)
+    for tube in tubes:
+        assert float(tube.lower[-1]) <= float(values.min()) and float(values.max()) <= float(tube.upper[-1])
+        assert float(tube.width[-1]) < 2.0 * float(values.max() - values.min())
+
+
+class Fickle:
+    """A step that does other operations whenever it is called."""
+
+    horizon, state_dim, calls = 1, 1, 0
+
+    def step(self, k, x, w):
+        self.calls += 1
+        return (torch.sin(x) if self.calls % 2 else torch.exp(x)) + w
+
+
+def test_bounds_of_another_operation_are_refused():
+    with pytest.raises(UsageError, match="does not always do the same operations: exp of 1, where it did sin of 1"):
+        Best().propagate(Fickle(), Box.around([0.5], [0.3]), Box.around([0.0], [0.1]))

@@ -25,9 +25,10 @@ from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable
-from sagemp_cli.reachability.form import Form, Operation, registers
-from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.form import ANGLE, Form, Operation, registers
 from sagemp_cli.sets.rounding import TINY, UNIT
+
+Kind = Literal["scalar", "product", "quotient", "angle"]
 
 
 class Combination(NamedTuple):
@@ -47,14 +48,14 @@ class Node(NamedTuple):
     """A nonlinear operation.
 
     Attributes:
-        kind: "scalar", a function of one variable; "product"; or "quotient", whose third operand is the reciprocal of
-            the second.
+        kind: "scalar", a function of one variable; "product"; "quotient", whose third operand is the reciprocal of
+            the second; or "angle", whose operands are y and x.
         operands: its operands, one after the other.
         size: entries of its result.
         name, operation, parameters: of a function of one variable.
     """
 
-    kind: Literal["scalar", "product", "quotient"]
+    kind: Kind
     operands: Combination
     size: int
     name: str = ""
@@ -185,13 +186,9 @@ class FoldedForm(Form):
         node = Node("scalar", self.combination(), math.prod(self.shape), name, operation, flat)
         return self.noted.result(node, self.shape)
 
-    def widened(self, name: str, band: Band) -> FoldedForm:
-        """A band of bounds, which are not known."""
-        raise NotFoldable
-
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        """Bounds are not known."""
-        raise NotFoldable
+    def angle(self, x: FoldedForm) -> FoldedForm:
+        """The angle of a point."""
+        return _of_several("angle", self, x, name="atan2", operation=ANGLE)
 
     def __getitem__(self, index: Any) -> FoldedForm:
         index = index if isinstance(index, tuple) else (index,)
@@ -272,13 +269,13 @@ def divide(a: Any, b: Any) -> FoldedForm:
     return FoldedForm(a.noted, a.rows / value, a.sizes / value.abs() + _tiny(a.sizes), a.error + 2 * UNIT)
 
 
-def _of_several(kind: Literal["product", "quotient"], *operands: FoldedForm) -> FoldedForm:
+def _of_several(kind: Kind, *operands: FoldedForm, **made_of: Any) -> FoldedForm:
     """The result of an operation whose operands are broadcast to one shape."""
     forms = _same(*operands)
     shape = np.broadcast_shapes(*(f.shape for f in forms))
     parts = [f.moved_by(lambda t: t.expand(*shape, -1)).combination() for f in forms]
     matrix, sizes = (torch.cat([part[i] for part in parts]) for i in range(2))
-    node = Node(kind, Combination(matrix, sizes, max(f.error for f in forms)), math.prod(shape))
+    node = Node(kind, Combination(matrix, sizes, max(f.error for f in forms)), math.prod(shape), **made_of)
     return forms[0].noted.result(node, shape)
 
 
@@ -364,9 +361,3 @@ def unsqueeze(x: FoldedForm, dim: int) -> FoldedForm:
 def squeeze(x: FoldedForm, dim: int) -> FoldedForm:
     """Remove a dimension of size one."""
     return x.moved_by(lambda t: t.squeeze(_of_columns(dim, x.dim())))
-
-
-@handles(torch.atan2, torch.arctan2, torch.Tensor.atan2, torch.Tensor.arctan2)
-def arctangent2(y: Any, x: Any) -> FoldedForm:
-    """Made of other functions, which depend on bounds."""
-    raise NotFoldable

@@ -6,14 +6,17 @@ The counterpart, cells first, of :class:`~sagemp_cli.reachability.affine.form.St
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sagemp_cli.reachability.affine.compiled.folding import Node
-from sagemp_cli.reachability.affine.form import SAFETY, Hints
+from sagemp_cli.reachability.affine.form import SAFETY, Hint, Hints, hint_of
+from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
+from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.relaxations.functions import on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
 from sagemp_cli.sets.rounding import TINY, UNIT
 
@@ -46,6 +49,8 @@ class Record(NamedTuple):
     upper: Array | None = None
     node: Node | None = None
     factors: tuple[Array, ...] = ()
+    given: tuple[Array, ...] = ()
+    turn: Turn | None = None
 
 
 class States:
@@ -57,7 +62,7 @@ class States:
         generators: ``(B, n, M)``.
         inputs: how many states and disturbances there are.
         own_radius: radii of all variables that a step has but the states.
-        hints: bounds of the operations' inputs that are known to hold.
+        hints: what is known of the operations.
     """
 
     def __init__(
@@ -112,13 +117,11 @@ class States:
         radius = self.radius(x.coefficients) + x.both[1] * ((x.error + self.sum_error) * SAFETY)
         return x.both[0] - radius, x.both[0] + radius
 
-    def narrowed(self, lower: Array, upper: Array, operation: int) -> tuple[Array, Array]:
-        """The bounds of an operation's input, intersected with what is known of it."""
-        hint = None if self.hints is None else self.hints[operation]
-        if hint is None:
-            return lower, upper
-        known = (side.reshape(lower.shape).numpy() for side in hint)
-        return np.maximum(lower, next(known)), np.minimum(upper, next(known))
+    def hint(self, name: str, size: int, after: Sequence[tuple[str, int]] = ()) -> Hint | None:
+        """What is known of the next operation, or of the one that comes after these."""
+        if self.hints is None:
+            return None
+        return hint_of(self.hints, name, size, [*((r.name, r.radius.shape[-1]) for r in self.records), *after])
 
     def result(self, record: Record, center: Array, magnitude: Array, coefficients: Array, factor: Array) -> Value:
         """Note an operation: ``center + factor coefficients``, and a new variable of the record's radius per entry."""
@@ -138,17 +141,29 @@ def diagonal(rows: Array, first: int) -> Array:
 
 
 class Bounded(NamedTuple):
-    """The operand of a function: its form, its bounds, and the function's band over them."""
+    """The operand of a function: its form, its bounds, the function's band over them, and of an angle more."""
 
     form: Value
     lower: Array
     upper: Array
     band: Band
+    given: tuple[Array, ...] = ()
+    turn: Turn | None = None
+
+
+def _narrowed(lower: Array, upper: Array, hint: Hint | None) -> tuple[Array, Array]:
+    """Bounds of an operation's input, intersected with what is known of it."""
+    if hint is None or hint.lower is None or hint.upper is None:
+        return lower, upper
+    return (
+        np.maximum(lower, hint.lower.reshape(lower.shape).numpy()),
+        np.minimum(upper, hint.upper.reshape(upper.shape).numpy()),
+    )
 
 
 def _scalar(node: Node, states: States, x: Value) -> Value:
     """A function of one variable: its band over the operand's bounds."""
-    lower, upper = states.narrowed(*states.bounds(x), len(states.records))
+    lower, upper = _narrowed(*states.bounds(x), states.hint(node.name, node.size))
     assert node.operation is not None
     band = node.operation.band_of_arrays(lower, upper, *node.parameters)
     return enclosed(node, states, Bounded(x, lower, upper, band))
@@ -156,8 +171,9 @@ def _scalar(node: Node, states: States, x: Value) -> Value:
 
 def sine_and_cosine_operands(node: Node, states: States, x: Value) -> tuple[Bounded, Bounded]:
     """Of a sine and the cosine that follows it, or the other way round."""
-    bounds, turn = states.bounds(x), len(states.records)
-    both = [states.narrowed(*bounds, turn), states.narrowed(*bounds, turn + 1)]
+    bounds, other = states.bounds(x), "cos" if node.name == "sin" else "sin"
+    hints = states.hint(node.name, node.size), states.hint(other, node.size, [(node.name, node.size)])
+    both = [_narrowed(*bounds, hint) for hint in hints]
     order = 1 if node.name == "sin" else -1
     lower, upper = (np.array(side) for side in zip(*both[::order], strict=True))
     bands = sine_and_cosine_bands(lower, upper)[::order]
@@ -167,11 +183,11 @@ def sine_and_cosine_operands(node: Node, states: States, x: Value) -> tuple[Boun
 
 def enclosed(node: Node, states: States, operand: Bounded) -> Value:
     """A function's result, within its band."""
-    x, lower, upper, band = operand
+    x, lower, upper, band, given, turn = operand
     slope, offset, radius = band
     magnitude = np.abs(slope) * x.both[1] + np.abs(offset) + (radius + TINY)
     radius = radius * SAFETY + magnitude * ((x.error + 4 * UNIT) * SAFETY)
-    record = Record(node.name, band, radius, states.size, x, lower, upper, node)
+    record = Record(node.name, band, radius, states.size, x, lower, upper, node, given=given, turn=turn)
     return states.result(record, x.both[0] * slope + offset, magnitude, x.coefficients, slope[..., None])
 
 
@@ -224,6 +240,49 @@ def _quotient(node: Node, states: States, operands: Value) -> Value:
     return Value(product.both + np.array([q, np.abs(q)]), product.coefficients, product.error + 2 * UNIT)
 
 
+def _angle(node: Node, states: States, operands: Value) -> Value:
+    """The angle of a point, of its distance across a direction in the middle of its angles."""
+    assert node.operation is not None
+    size, hint = node.size, states.hint(node.name, node.size)
+    lower, upper = states.bounds(operands)
+    low, high = on_tensors(
+        _arctangent2.value_range,
+        *(
+            np.ascontiguousarray(a)
+            for side in (slice(size), slice(size, None))
+            for a in (lower[:, side], upper[:, side])
+        ),
+    )
+    if hint is None or hint.turn is None:
+        turn = on_tensors(_arctangent2.turn, low, high)
+    else:
+        turn = Turn(*(part.reshape(low.shape).numpy() for part in hint.turn))
+    c, s, angle = turn
+    (y, size_y), (x, size_x) = operands.both[..., :size], operands.both[..., size:]
+    gy, gx = operands.coefficients[:, :size], operands.coefficients[:, size:]
+    magnitude = [np.abs(c) * size_y + np.abs(s) * size_x + TINY, np.abs(c) * size_x + np.abs(s) * size_y + TINY]
+    turned = Value(
+        np.concatenate([np.array([c * y - s * x, magnitude[0]]), np.array([c * x + s * y, magnitude[1]])], axis=-1),
+        np.concatenate([c[..., None] * gy - s[..., None] * gx, c[..., None] * gx + s[..., None] * gy], axis=-2),
+        operands.error + 2 * UNIT,
+    )
+    lower, upper = states.bounds(turned)
+    radius = states.radius(turned.coefficients) + turned.both[1] * ((turned.error + states.sum_error) * SAFETY)
+    ratio = np.sqrt(radius[:, size:] / radius[:, :size])
+    v, u = turned.coefficients[:, :size] * ratio[..., None], turned.coefficients[:, size:] / ratio[..., None]
+    # Rounding of the sums, and of scaling (3 more units each) is within twice the usual slack.
+    slack = turned.both[1] * (2 * (turned.error + states.sum_error) * SAFETY)
+    doubt = (slack[:, :size] * ratio + slack[:, size:] / ratio) * SAFETY
+    ends = states.radius(np.concatenate([v + u, v - u], axis=-2))
+    (center, middle), bounds = np.split(turned.both[0], 2, axis=-1), (lower[:, size:], upper[:, size:])
+    twist = _arctangent2.twist(center, radius[:, size:], ends[:, :size] + doubt, ends[:, size:] + doubt)
+    given = (*bounds, middle, *twist, angle, low, high)
+    across = Value(turned.both[..., :size], turned.coefficients[:, :size], turned.error)
+    lower, upper = _narrowed(lower[:, :size], upper[:, :size], hint)
+    band = node.operation.band_of_arrays(lower, upper, *given)
+    return enclosed(node, states, Bounded(across, lower, upper, band, given, turn))
+
+
 _BLOCK = 2**16
 """Entries of an array that stays in the cache."""
 _ONES = np.ones(_BLOCK)
@@ -232,4 +291,5 @@ EVALUATE: dict[str, Callable[[Node, States, Value], Value]] = {
     "scalar": _scalar,
     "product": _product,
     "quotient": _quotient,
+    "angle": _angle,
 }

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.affine.compiled.operations import Record, States, Value
 from sagemp_cli.reachability.affine.form import AffineForm, Factors, Relaxed, StepFrame
+from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.sets.rounding import TINY
 
@@ -106,6 +107,8 @@ class _Turn:
             parts = [self.coefficients([q.factors[i] for q in group]) for i in range(2)]
             parts += [vectors(lambda q, i=i: q.factors[i]) for i in range(2, len(r.factors))]
             factors = list(map(Factors, *parts))
+        given = zip(*(vectors(lambda q, i=i: q.given[i]) for i in range(len(r.given))), strict=True)
+        turns = map(Turn, *(vectors(lambda q, i=i: q.turn[i]) for i in range(3))) if r.turn else nothing
         operation, parameters = (None, ()) if node is None else (node.operation, node.parameters)
         numbers = zip(
             bands,
@@ -115,12 +118,14 @@ class _Turn:
             lower,
             upper,
             factors,
+            given if r.given else [()] * self._count,
+            turns,
             strict=True,
         )
         return [
             Relaxed(
                 *(r.name, band, radius, r.first, center, coefficients, magnitude, r.form.error),
-                *(low, high, operation, parameters, factor),
+                *(low, high, operation, parameters, factor, more, turn),
             )
-            for band, radius, center, magnitude, coefficients, low, high, factor in numbers
+            for band, radius, center, magnitude, coefficients, low, high, factor, more, turn in numbers
         ]
