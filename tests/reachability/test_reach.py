@@ -673,7 +673,7 @@ def test_no_function_of_torch_that_is_given_a_value_kills_the_interpreter():
         "tensor as_tensor asarray Tensor DoubleTensor FloatTensor from_dlpack frombuffer from_numpy sparse_coo_tensor "
         "scalar_tensor vmap nested set_ is_tensor numel stack where index_put bincount svd"
     )
-    script = str(pathlib.Path(__file__).with_name("fuzzed_functions.py"))
+    script = str(pathlib.Path(__file__).parent / "program" / "fuzzed_functions.py")
     done = subprocess.run(
         [sys.executable, script, "torch", *names.split()], capture_output=True, text=True, check=False
     )

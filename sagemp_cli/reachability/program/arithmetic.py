@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the functions that have a relaxation)
-from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.errors import NonFiniteError, UnsupportedOperationError
 from sagemp_cli.reachability.form import SHARED, unsupported
+from sagemp_cli.reachability.program.constants import exact_parts
 from sagemp_cli.reachability.program.value import ANSWERS, Traced, answers, exact, ids_of, is_tensor, recorder_of
 
 
@@ -22,7 +23,7 @@ def elementwise(function: Any, *args: Any, **kwargs: Any) -> Traced:
     name = function.__name__
     recorder = recorder_of(*args, *kwargs.values())
     shapes = [np.shape(v) if isinstance(v, np.ndarray) else v.shape for v in (*args, *kwargs.values()) if is_tensor(v)]
-    shape = torch.broadcast_shapes(*shapes)
+    shape = torch.Size(np.broadcast_shapes(*shapes))  # torch's own imports a thousand modules
 
     def operand(value: Any) -> Any:
         if is_tensor(value):
@@ -93,13 +94,27 @@ for _operation, _word in (
 @answers("add", "__add__", "__radd__")
 def add(a: Any, b: Any, *, alpha: float = 1) -> Traced:
     """``a + alpha b``."""
-    return elementwise(_sum, a, b if alpha == 1 else multiply(b, alpha))
+    return add_scaled("add", a, b, alpha)
+
+
+def add_scaled(name: str, a: Any, b: Any, factor: Any) -> Traced:
+    """``a + factor b``, either of them a value, whatever else a constant."""
+    if factor == 1:
+        return elementwise(_sum, a, b)
+    if isinstance(b, Traced):
+        return elementwise(_sum, a, multiply(b, factor))
+    return add_parts(a, exact_parts(name, lambda c, f: f * c, b, factor))
+
+
+def add_parts(a: Traced, parts: list[Tensor]) -> Traced:
+    """A value plus what is the sum of some constants."""
+    return functools.reduce(functools.partial(elementwise, _sum), parts, a)
 
 
 @answers("sub", "subtract", "__sub__")
 def subtract(a: Any, b: Any, *, alpha: float = 1) -> Traced:
     """``a - alpha b``."""
-    return elementwise(_difference, a, b if alpha == 1 else multiply(b, alpha))
+    return elementwise(_difference, a, b) if alpha == 1 else add_scaled("sub", a, b, -alpha)
 
 
 @answers("rsub", "__rsub__")
@@ -110,9 +125,7 @@ def reverse_subtract(a: Any, b: Any, *, alpha: float = 1) -> Traced:
 
 @answers("mul", "multiply", "__mul__", "__rmul__")
 def multiply(a: Any, b: Any) -> Any:
-    """Product; of two constants as torch computes it."""
-    if not isinstance(a, Traced) and not isinstance(b, Traced):
-        return a * b
+    """Product."""
     if not (isinstance(a, Traced) and isinstance(b, Traced)):
         return elementwise(_product, a, b)
     # A matrix of values often has constants in it (a rotation's zeros and ones): with these, products are linear.
@@ -164,29 +177,39 @@ def power(a: Any, exponent: Any) -> Traced:
 @answers("addcmul")
 def add_product(a: Any, b: Any, c: Any, *, value: float = 1) -> Traced:
     """``a + value b c``."""
-    return add(a, multiply(b, c), alpha=value)
+    if isinstance(b, Traced) or isinstance(c, Traced):
+        return add_scaled("addcmul", a, multiply(b, c), value)
+    return add_parts(a, exact_parts("addcmul", lambda *factors: math.prod(factors), value, b, c))
 
 
 @answers("addcdiv")
 def add_quotient(a: Any, b: Any, c: Any, *, value: float = 1) -> Traced:
     """``a + value b / c``."""
-    return add(a, divide(b, c), alpha=value)
+    if isinstance(b, Traced) or isinstance(c, Traced):
+        return add_scaled("addcdiv", a, divide(b, c), value)
+    if not bool(exact(c, operation="addcdiv").all()):
+        raise NonFiniteError("constant of 'addcdiv' is 0 in the denominator")
+    return add_parts(a, exact_parts("addcdiv", lambda v, n, d: v * n / d, value, b, c))
 
 
 @answers("lerp")
 def interpolate(a: Any, b: Any, weight: Any) -> Traced:
     """``a + weight (b - a)``."""
-    return add(a, multiply(b - a, weight))
+    if isinstance(a, Traced) or isinstance(b, Traced):
+        return elementwise(_sum, a, multiply(elementwise(_difference, b, a), weight))
+    parts = exact_parts("lerp", lambda start, end: end - start, a, b)
+    return functools.reduce(functools.partial(elementwise, _sum), [multiply(weight, p) for p in parts], a)
 
 
 @answers("hypot")
 def hypotenuse(a: Any, b: Any) -> Traced:
     """``sqrt(a^2 + b^2)``."""
-    return elementwise(torch.sqrt, add(_square(a), _square(b)))
-
-
-def _square(a: Any) -> Any:
-    return elementwise(torch.square, a) if isinstance(a, Traced) else a * a
+    if not isinstance(a, Traced):
+        a, b = b, a
+    square = elementwise(torch.square, a)
+    if isinstance(b, Traced):
+        return elementwise(torch.sqrt, elementwise(_sum, square, elementwise(torch.square, b)))
+    return elementwise(torch.sqrt, add_parts(square, exact_parts("hypot", lambda c: c * c, b)))
 
 
 @answers("dropout", "alpha_dropout", "feature_alpha_dropout", "dropout1d", "dropout2d", "dropout3d")

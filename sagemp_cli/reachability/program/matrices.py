@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.form import unsupported
-from sagemp_cli.reachability.program.arithmetic import add, divide, elementwise, multiply
+from sagemp_cli.reachability.program.arithmetic import add, add_scaled, divide, elementwise, multiply
 from sagemp_cli.reachability.program.conversions import same_type
 from sagemp_cli.reachability.program.value import Traced, answers, exact, is_tensor
 
@@ -64,16 +64,25 @@ def mean(
     return divide(result, max(x.numel() // max(result.numel(), 1), 1))
 
 
-@answers("norm", "linalg_norm", "linalg_vector_norm", "vector_norm")
+@answers("norm", "linalg_vector_norm", "vector_norm")
 def norm(
     x: Traced, p: Any = 2, dim: Any = None, keepdim: bool = False, *, ord: Any = None, dtype: Any = None
 ) -> Traced:  # noqa: A002
     """Euclidean norm."""
     same_type(dtype)
     kind = p if ord is None else ord
-    if kind is not None and kind not in (2, 2.0, "fro"):
+    if kind is not None and kind not in (2, "fro"):
         raise unsupported(f"norm(p={kind})")
     return elementwise(torch.sqrt, total(elementwise(torch.square, x), dim, keepdim))
+
+
+@answers("linalg_norm")
+def norm_of_vectors(x: Traced, ord: Any = None, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Traced:  # noqa: A002
+    """Euclidean norm of vectors, Frobenius norm of matrices; the 2-norm of a matrix is another one."""
+    over = (x.dim() if dim is None else 1) if not isinstance(dim, (tuple, list)) else len(dim)
+    if over == 2 and ord not in (None, "fro"):
+        raise unsupported(f"linalg.norm(ord={ord}) of a matrix")
+    return norm(x, ord, dim, keepdim, dtype=dtype)
 
 
 @answers("linear")
@@ -100,6 +109,10 @@ def matrix_product(a: Any, b: Any) -> Traced:
     """Matrix products, one or both of whose factors are values."""
     if isinstance(a, Traced) and isinstance(b, Traced):
         return _matrix_product(a, b)
+    if not isinstance(a, Traced) and not isinstance(b, Traced):
+        raise UnsupportedOperationError(
+            "the product of two constant matrices is part of an operation; compute it before"
+        )
     return _multilinear(torch.matmul, a, b)
 
 
@@ -130,7 +143,9 @@ def outer(a: Any, b: Any) -> Traced:
 @answers("addmm", "addmv", "baddbmm")
 def add_matrix_product(c: Any, a: Any, b: Any, *, beta: float = 1, alpha: float = 1) -> Traced:
     """``beta c + alpha a b``."""
-    return add(multiply(c, beta), matrix_product(a, b), alpha=alpha)
+    product = matrix_product(a, b)
+    scaled = product if alpha == 1 else multiply(product, alpha)
+    return scaled if beta == 0 else add_scaled("addmm", scaled, c, beta)
 
 
 @answers("einsum")
@@ -150,8 +165,14 @@ def _einsum(equation: str, *operands: Tensor) -> Tensor:
     return torch.einsum(equation, *operands)
 
 
-@answers("cross", "linalg_cross")
-def cross(a: Any, b: Any, dim: int = -1) -> Traced:
+@answers("cross")
+def cross(a: Any, b: Any, dim: int | None = None) -> Traced:
+    """Cross product of three-vectors, along the first dimension of three entries."""
+    return cross_along(a, b, dim=next((i for i, n in enumerate(a.shape) if n == 3), -1) if dim is None else dim)
+
+
+@answers("linalg_cross")
+def cross_along(a: Any, b: Any, *, dim: int = -1) -> Traced:
     """Cross product of three-vectors."""
     if a.shape[dim] != 3 or a.shape != b.shape:
         raise UnsupportedOperationError(
@@ -180,7 +201,8 @@ def differences(x: Traced, n: int = 1, dim: int = -1, prepend: Any = None, appen
 def _multilinear(function: Callable[..., Tensor], *operands: Any) -> Traced:
     """A function that is linear in its one value: its matrix has what it gives for the unit vectors as columns.
 
-    Those are exact: each entry is one product with 1 and sums of zeros.
+    Those are exact: each entry is one product with 1 and sums of zeros. Where entries of the constant are summed it is
+    not, and refused.
     """
     name = getattr(function, "__name__", "einsum")
     (at,) = [i for i, o in enumerate(operands) if isinstance(o, Traced)]
@@ -192,7 +214,15 @@ def _multilinear(function: Callable[..., Tensor], *operands: Any) -> Traced:
 
     shape = of(torch.zeros(x.shape, dtype=torch.float64)).shape
     units = torch.eye(x.numel(), dtype=torch.float64).reshape(x.numel(), *x.shape)
-    return _linear(x, torch.stack([of(unit).reshape(-1) for unit in units], dim=-1), shape)
+    matrix = torch.stack([of(unit).reshape(-1) for unit in units], dim=-1)
+    terms = [None if f is None else torch.ones_like(f) for f in fixed]
+    counts = [function(*(unit if t is None else t for t in terms)) for unit in units] if len(terms) > 1 else []
+    if any(bool((c > 1).any()) for c in counts):
+        raise UnsupportedOperationError(
+            f"torch operation '{name}' sums entries of a constant; sum them before, so that their rounding is part "
+            f"of the step"
+        )
+    return _linear(x, matrix, shape)
 
 
 def _extreme(name: str) -> None:

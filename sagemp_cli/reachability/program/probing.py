@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.program.memory import widened
 from sagemp_cli.reachability.program.program import Program, Recorder
 from sagemp_cli.reachability.program.value import UFUNCS, Traced, exact
 from sagemp_cli.sets import Box
@@ -40,20 +41,9 @@ class _Exact(Tensor):
     @classmethod
     def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
         with torch._C.DisableTorchFunctionSubclass():
-            args = _widened(tuple(args))
-            kwargs = {key: _widened(value) for key, value in (kwargs or {}).items()}
+            args = widened(tuple(args))
+            kwargs = {key: widened(value) for key, value in (kwargs or {}).items()}
         return super().__torch_function__(function, types, args, kwargs)
-
-
-def _widened(value: Any) -> Any:
-    if isinstance(value, (list, tuple)) and not hasattr(value, "_fields"):
-        return type(value)(map(_widened, value)) if any(map(_contains_tensor, value)) else value
-    narrow = isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float16, torch.bfloat16)
-    return value.detach().to(torch.float64) if narrow else value
-
-
-def _contains_tensor(value: Any) -> bool:
-    return isinstance(value, (Tensor, list, tuple))
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,10 @@ class Recorder:
         self._check_written(ids)
         return torch.tensor(self._constant)[self._owners(ids)]
 
+    def example(self, ids: Tensor) -> Tensor:
+        """The numbers of the example, in the shape and strides of the ids; NaN where nothing was written."""
+        return torch.where(ids < 0, torch.nan, self._table[ids.clamp(min=0)])
+
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def operand(self, ids: Tensor, *, full: bool = False) -> Slot | Tensor:

@@ -11,6 +11,9 @@ Constants are taken as the exact numbers they are: float32 weights are not round
 
 from __future__ import annotations
 
+import copy
+import inspect
+import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -20,6 +23,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.form import unsupported
+from sagemp_cli.reachability.program.memory import Example
 from sagemp_cli.reachability.program.program import Recorder
 
 _CLAMPS = ("clamp", "clip", "clamp_min", "clamp_max", "maximum", "minimum", "fmax", "fmin", "max", "min", "hardtanh")
@@ -107,6 +111,14 @@ class Traced(Tensor):
         """Shape, or one entry of it."""
         return self.ids.size() if dim is None else self.ids.size(dim)
 
+    def stride(self, dim: int | None = None) -> Any:
+        """Strides, or one of them."""
+        return self.ids.stride() if dim is None else self.ids.stride(dim)
+
+    def storage_offset(self) -> int:
+        """Where the first entry lies."""
+        return self.ids.storage_offset()
+
     def numel(self) -> int:
         """Number of entries."""
         return self.ids.numel()
@@ -117,7 +129,7 @@ class Traced(Tensor):
         """True."""
         return True
 
-    is_contiguous = lambda self, *_, **__: self.ids.is_contiguous()  # noqa: E731
+    is_contiguous = lambda self, *args, **kwargs: self.ids.is_contiguous(*args, **kwargs)  # noqa: E731
     is_complex = lambda self: False  # noqa: E731
 
     def __len__(self) -> int:
@@ -130,7 +142,7 @@ class Traced(Tensor):
         return self._like(self.ids)
 
     def __deepcopy__(self, memo: Any) -> Traced:
-        return self._like(self.ids.clone())
+        return self._like(copy.deepcopy(self.ids, memo))
 
     def __repr__(self) -> str:
         return f"Traced(shape={tuple(self.shape)})"
@@ -152,16 +164,6 @@ class Traced(Tensor):
     def __setitem__(self, index: Any, value: Any) -> None:
         refuse_traced_index(index)
         self.ids[index] = ids_of(self.recorder, value, "assignment")
-
-    def _assign(self, value: Any, operation: str) -> Traced:
-        """What torch does in place: the ids of all views change with it."""
-        ids = ids_of(self.recorder, value, operation)
-        if torch.broadcast_shapes(ids.shape, self.ids.shape) != self.ids.shape:
-            raise UsageError(
-                f"step: '{operation}' cannot write shape {tuple(ids.shape)} into shape {tuple(self.ids.shape)}"
-            )
-        self.ids.copy_(ids)
-        return self
 
     # -- what a set does not have -------------------------------------------------------------------------------------
 
@@ -222,10 +224,9 @@ class Traced(Tensor):
         return self._refuse(f"numpy operation '{function.__name__}' does not work on sets; use torch's")
 
 
-def _operator(function: Any, *, swapped: bool = False, in_place: bool = False) -> Callable[[Traced, Any], Any]:
+def _operator(function: Any, *, swapped: bool = False) -> Callable[[Traced, Any], Any]:
     def apply(self: Traced, *other: Any) -> Any:
-        result = _dispatch(function, (*other, self) if swapped else (self, *other), {})
-        return self._assign(result, function.__name__) if in_place else result
+        return _dispatch(function, (*other, self) if swapped else (self, *other), {})
 
     return apply
 
@@ -245,7 +246,8 @@ for _name, _function in {
 }.items():
     setattr(Traced, f"__{_name}__", _operator(_function))
     setattr(Traced, f"__r{_name}__", _operator(_function, swapped=True))
-    setattr(Traced, f"__i{_name}__", _operator(_function, in_place=True))
+    if hasattr(torch.Tensor, f"{_function.__name__}_"):  # x @= A is x = x @ A
+        setattr(Traced, f"__i{_name}__", _operator(getattr(torch.Tensor, f"{_function.__name__}_")))
 for _name, _function in {
     "neg": torch.neg,
     "pos": torch.positive,
@@ -310,38 +312,53 @@ def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
     if kwargs.get("out") is not None:
         raise UnsupportedOperationError(f"torch operation '{name}' is not supported with out=")
     kwargs = {key: value for key, value in kwargs.items() if key != "out"}
-    if kwargs.pop("inplace", False):
-        return args[0]._assign(_dispatch(function, args, kwargs), name)
-    if name.endswith("_") and not name.endswith("__"):
-        return _in_place(name, args, kwargs)
-    answer = ANSWERS.get(name) or ANSWERS.get(function)
-    if answer is None:
-        raise unsupported(name)
+    if name in ("__getitem__", "__setitem__"):  # of a plain tensor: refused, before torch writes into it
+        return ANSWERS[name](*args, **kwargs)
+    answer = _in_place(name, args) if name.endswith("_") and not name.endswith("__") else _answer_of(function, name)
+    # Torch goes first: what it refuses it must refuse before anything is written.
+    example = Example(Traced).run(function, args, kwargs)
+    args, kwargs = _out_of_place(function, args, kwargs)
     try:
-        return answer(*args, **kwargs)
+        return example.settle(answer(*args, **kwargs), name)
     except TypeError as error:
         raise UnsupportedOperationError(
             f"torch operation '{name}' is not supported with these arguments: {error}"
         ) from error
 
 
-def _in_place(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Traced:
-    target, rest = args[0], args[1:]
-    if not isinstance(target, Traced):
+def _out_of_place(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The arguments without ``inplace``: what is recorded has no memory to write into."""
+    if any(a is True for a in args) and isinstance(function, types.FunctionType):
+        bound = inspect.signature(function).bind(*args, **kwargs).arguments
+        if "inplace" in bound:
+            args, kwargs = (), dict(bound)
+    return args, {key: value for key, value in kwargs.items() if key != "inplace"}
+
+
+def _answer_of(function: Any, name: str) -> Callable[..., Any]:
+    answer = ANSWERS.get(name) or ANSWERS.get(function)
+    if answer is None:
+        raise unsupported(name)
+    return answer
+
+
+def _in_place(name: str, args: tuple[Any, ...]) -> Callable[..., Any]:
+    """What is written in place; that it is, and where, is seen from what torch does."""
+    if not isinstance(args[0], Traced):
         raise UnsupportedOperationError(
             f"torch operation '{name}' writes into a plain tensor, which cannot hold a set; "
             f"start from torch.zeros_like(x)"
         )
     if name in ("detach_", "requires_grad_"):
-        return target
-    if name in ("copy_", "fill_"):
-        return target._assign(rest[0], name)
-    if name == "zero_":
-        return target._assign(0.0, name)
+        return lambda target, *_, **__: target
+    if name in ("copy_", "fill_", "zero_"):
+        return lambda target, value=0.0, *_: target._like(
+            ids_of(target.recorder, value, name).expand(target.shape).clone()
+        )
     function = getattr(torch.Tensor, name[:-1], None)
     if function is None or name in _RESHAPES:
         raise unsupported(name)
-    return target._assign(_dispatch(function, args, kwargs), name)
+    return _answer_of(function, name[:-1])
 
 
 def refuse_traced_index(index: Any) -> None:

@@ -25,7 +25,7 @@ from sagemp_cli.reachability.program.value import Traced
 NAMESPACES = (
     "torch", "torch.Tensor", "torch.nn.functional", "torch.func", "torch.linalg", "torch.special", "torch.fft",
     "torch.nested", "torch.sparse", "torch.utils.dlpack", "torch.autograd.functional", "torch.nn.utils",
-    "torch.nn.init", "torch.masked", "torch._C._nn", "torch._C._VariableFunctions", "torch.signal.windows",
+    "torch.nn.init", "torch.masked", "torch._C._nn", "torch.signal.windows",
 )  # fmt: skip
 
 NOT_CALLED = frozenset(
@@ -64,9 +64,7 @@ def functions(namespace: str) -> Iterator[tuple[str, Callable[..., Any]]]:
     """Name and function of all that a namespace offers; classes too, since they construct."""
     owner = torch.Tensor if namespace == "torch.Tensor" else importlib.import_module(namespace)
     for name in sorted(dir(owner)):
-        if name in NOT_CALLED or (
-            name.startswith("_") and namespace not in ("torch.Tensor", "torch._C._VariableFunctions")
-        ):
+        if name in NOT_CALLED or (name.startswith("_") and namespace != "torch.Tensor"):
             continue
         try:
             function = getattr(owner, name)
