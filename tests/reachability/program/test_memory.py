@@ -34,7 +34,7 @@ ONE = {
     "view": lambda t: t.view(-1),
     "view or reshape": lambda t: t.view(-1) if t.is_contiguous() else t.reshape(-1),
     "stride": lambda t: t.clone() if t.stride()[-1:] == (1,) else t[...],
-    "T": lambda t: t.T,
+    "T": lambda t: t.T if t.dim() == 2 else t,
     "mT": lambda t: t.mT,
     "transpose": lambda t: t.transpose(0, -1),
     "squeeze": lambda t: t.squeeze(),
