@@ -19,6 +19,7 @@ class Progress(Protocol):
 
     def task(self, description: str, total: int, done: int = 0) -> AbstractContextManager[Task]:
         """Open a task of ``total`` units of which ``done`` were finished before (a resumed run)."""
+        ...
 
     def say(self, text: str) -> None:
         """Print one line beside the bars."""

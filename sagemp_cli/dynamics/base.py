@@ -7,8 +7,6 @@ only operations for which the propagators have a relaxation (an unknown one is a
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor, nn
 
@@ -27,12 +25,16 @@ class Dynamics(nn.Module):
     ``x_{k+1} = x_k + dt f(x_k, u_k) + w_k``.
     """
 
-    state_names: ClassVar[tuple[str, ...]]
-    state_units: ClassVar[tuple[str, ...]]
-    control_names: ClassVar[tuple[str, ...]]
-    control_units: ClassVar[tuple[str, ...]]
-    position: ClassVar[tuple[int, ...]]
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    control_names: tuple[str, ...]
+    control_units: tuple[str, ...]
+    position: tuple[int, ...]
     """Indices of the state that are the position in the scene."""
+    control_lower: Tensor
+    control_upper: Tensor
+    state_lower: Tensor
+    state_upper: Tensor
 
     def __init__(
         self,

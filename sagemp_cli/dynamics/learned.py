@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -78,9 +78,7 @@ class Learned(Dynamics):
         self.activation = activation
         self.reads = self._columns(self.state_names if inputs is None else inputs)
         widths = (self.state_dim + self.control_dim, *hidden, self.state_dim)
-        self.layers = nn.ModuleList(
-            nn.Linear(a, b, dtype=torch.float64) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.layers = Layers(nn.Linear(a, b, dtype=torch.float64) for a, b in zip(widths[:-1], widths[1:], strict=True))
         self.requires_grad_(False)
         for parameter in self.layers.parameters():
             parameter.fill_(torch.nan)
@@ -111,6 +109,13 @@ class Learned(Dynamics):
                 raise ConfigError(f"dynamics.inputs: there is no state '{name}'{near}")
         states = (i for i, name in enumerate(self.state_names) if name in inputs)
         return (*states, *range(self.state_dim, self.state_dim + self.control_dim))
+
+
+class Layers(nn.ModuleList):
+    """Linear layers, one after the other."""
+
+    def __iter__(self) -> Iterator[nn.Linear]:
+        return cast("Iterator[nn.Linear]", super().__iter__())
 
 
 def perceptron(layers: Iterable[nn.Linear], activation: str, h: Tensor) -> Tensor:

@@ -16,13 +16,16 @@ class Loop(Protocol):
     @property
     def horizon(self) -> int:
         """Number of steps K."""
+        ...
 
     @property
     def state_dim(self) -> int:
         """Number of states n."""
+        ...
 
     def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
         """States ``(..., K+1, n)`` and controls ``(..., K, m)`` from starts ``(..., n)`` and ``w (..., K, d)``."""
+        ...
 
 
 def random_disturbances(disturbance: Box, count: int, *, horizon: int, generator: torch.Generator) -> Tensor:

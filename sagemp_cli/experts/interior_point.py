@@ -40,18 +40,23 @@ class ChainProblem(Protocol):
 
     def cost(self, z: Array) -> float:
         """The cost of a chain."""
+        ...
 
     def cost_gradient(self, z: Array) -> Array:
         """Its gradient ``(K+1, n+m)``."""
+        ...
 
     def cost_curvature(self) -> tuple[Array, Array]:
         """Its Hessian: diagonals ``(K+1, n+m)`` and the coupling ``(K, m)`` of ``u_k`` with ``u_{k+1}``."""
+        ...
 
     def constraints(self, z: Array) -> tuple[Array, Array]:
         """Defects ``(K+1, n)`` and inequalities ``(K+1, c)``."""
+        ...
 
     def jacobians(self, z: Array) -> tuple[Array, Array]:
         """``df/dz (K, n, n+m)`` at nodes 0..K-1 and the inequalities' Jacobian ``(K+1, c, n+m)``."""
+        ...
 
 
 @dataclass(frozen=True)

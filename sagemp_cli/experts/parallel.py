@@ -77,4 +77,5 @@ def _start_worker(expert: Expert) -> None:
 
 
 def _solve_in_worker(problem: Problem) -> Demonstration:
+    assert _expert is not None, "the worker was not started"
     return solve_problem(problem, _expert)

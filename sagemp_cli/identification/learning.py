@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.dynamics.learned import Learned, perceptron
+from sagemp_cli.dynamics.learned import Layers, Learned, perceptron
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification.enclosure_loss import enclosure_error
 from sagemp_cli.identification.transitions import Transitions, domain_of
@@ -160,7 +160,7 @@ class _Network(nn.Module):
         widths = [len(self.columns), *(layer.out_features for layer in robot.layers)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-            self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+            self.layers = Layers(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalised increments from normalised inputs."""
@@ -177,7 +177,7 @@ class _Network(nn.Module):
         shape = (wanted.boxes, len(self.columns))
         radius = wanted.radius * torch.rand(shape, generator=generator)
         center = (2 * torch.rand(shape, generator=generator) - 1) * (1 - radius)
-        return enclosure_error(module.layers, module.activation, center, radius).mean()
+        return enclosure_error(list(module.layers), module.activation, center, radius).mean()
 
     @torch.no_grad()
     def put_into(self, robot: Learned) -> None:

@@ -247,8 +247,8 @@ class _Run:
         with _interrupt_postponed():
             self.optimizer.param_groups[0]["lr"] = rate
             self.optimizer.step()
-            if self.average is not None:
-                self._follow(ema_decay)
+            if self.average is not None and ema_decay is not None:
+                self._follow(self.average, ema_decay)
             for name in figures.keys() - self.figures.keys():
                 self.figures[name] = [math.nan] * self.done
             for name, values in self.figures.items():
@@ -257,11 +257,11 @@ class _Run:
             self.random_state = self.generator.get_state()
 
     @torch.no_grad()
-    def _follow(self, decay: float) -> None:
+    def _follow(self, average: nn.Module, decay: float) -> None:
         decay = min(decay, (1 + self.done) / (10 + self.done))
-        for mean, now in zip(self.average.parameters(), self.module.parameters(), strict=True):
+        for mean, now in zip(average.parameters(), self.module.parameters(), strict=True):
             mean.lerp_(now, 1 - decay)
-        for mean, now in zip(self.average.buffers(), self.module.buffers(), strict=True):
+        for mean, now in zip(average.buffers(), self.module.buffers(), strict=True):
             mean.copy_(now)
 
     def record_validation(self, validate: Validation) -> None:

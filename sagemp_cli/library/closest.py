@@ -42,9 +42,9 @@ def closest_reference(
     points = library[:, 1:].reshape(len(library), -1)
     queries = sampled[:, 1:].reshape(len(sampled), -1)
     if len(library) >= tree_from and (eligible is None or eligible.all()):
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        _, index = cKDTree(points).query(queries)
+        _, index = KDTree(points).query(queries)
         index = np.asarray(index, dtype=np.int64)
     else:
         index = np.empty(len(queries), dtype=np.int64)

@@ -23,6 +23,10 @@ class Tracker(nn.Module):
     n-input linear layer whose bias depends on k: :meth:`folded` gives that form.
     """
 
+    error_scale: Tensor
+    control_scale: Tensor
+    control_offset: Tensor
+
     def __init__(
         self,
         *,
@@ -75,7 +79,7 @@ class Tracker(nn.Module):
     def control_range(self) -> tuple[Tensor, Tensor]:
         """What no control leaves in real arithmetic, ``(m,)`` each, rounded outwards; infinite unless it saturates."""
         reach = self.control_scale.abs() if self.saturate else torch.full_like(self.control_scale, torch.inf)
-        return tuple(_outwards(self.control_offset, side * reach) for side in (-1.0, 1.0))
+        return _outwards(self.control_offset, -reach), _outwards(self.control_offset, reach)
 
     def folded(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """First layer on a fixed window ``(..., N, n)`` as ``weight @ x + bias``: ``(h, n)`` and ``(..., h)``.
@@ -83,6 +87,7 @@ class Tracker(nn.Module):
         Equal to the first layer of :meth:`forward` in exact arithmetic.
         """
         first = self.layers[0]
+        assert isinstance(first, nn.Linear)
         blocks = first.weight.unflatten(-1, (self.lookahead, self.state_dim)) * self.error_scale
         bias = torch.einsum("hjn,...jn->...h", blocks, window) + first.bias
         return -blocks.sum(1), bias

@@ -34,6 +34,7 @@ class Planner(Protocol):
             count: how many references.
             generator: the source of all randomness: the same state gives the same references.
         """
+        ...
 
 
 @runtime_checkable
@@ -45,9 +46,11 @@ class Proposer(Planner, Protocol):
 
     def propose(self, start: Tensor, goal: Box, *, scene: Scene, count: int, generator: torch.Generator) -> Tensor:
         """Plans ``(count, K+1, n)`` that begin near the start."""
+        ...
 
     def settle(self, plans: Tensor, start: Tensor) -> Tensor:
         """The plans moved onto their starts ``(n,)`` or ``(count, n)``, without a jump."""
+        ...
 
 
 class StoredPlanner(Planner, Protocol):
@@ -66,6 +69,7 @@ class StoredPlanner(Planner, Protocol):
     @property
     def arguments(self) -> dict[str, Any]:
         """Constructor arguments as plain data."""
+        ...
 
 
 class LearnedPlanner(StoredPlanner, Protocol):
@@ -103,6 +107,7 @@ class SelfTaughtPlanner(StoredPlanner, Protocol):
 
         ``checkpoint``, ``identity`` and ``progress`` are as in :func:`sagemp_cli.learning.fit.fit`.
         """
+        ...
 
 
 def affordable(planner: Planner, wanted: int) -> int:

@@ -58,6 +58,10 @@ class Diffusion(GenerativePlanner):
 
     loss_type: ClassVar = DiffusionLoss
 
+    _abar: Tensor
+    signal: Tensor
+    noise: Tensor
+
     def __init__(
         self,
         *,

@@ -40,6 +40,8 @@ class FromFile(nn.Module):
 
     learns_from: ClassVar[str] = "nothing"
 
+    trajectories: Tensor
+
     def __init__(
         self,
         *,

@@ -63,6 +63,10 @@ class GenerativePlanner(nn.Module, ABC):
 
     learns_from: ClassVar[str] = "demonstrations"
 
+    goal_radius: Tensor
+    goal_bounded: Tensor
+    usual_end: Tensor
+
     def __init__(
         self,
         *,

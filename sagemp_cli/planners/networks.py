@@ -18,6 +18,8 @@ class TimeMLP(nn.Module):
     an untrained field then moves little, and what is integrated from it stays finite.
     """
 
+    angles: Tensor
+
     def __init__(
         self, inputs: int, outputs: int, *, hidden: list[int], frequencies: int, dtype: torch.dtype = torch.float32
     ) -> None:

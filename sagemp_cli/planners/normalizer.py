@@ -14,6 +14,9 @@ class Normalizer(nn.Module):
     Mean and scale are float64 buffers ``(n,)``, so they travel with the weights of the module that owns them.
     """
 
+    mean: Tensor
+    scale: Tensor
+
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(dim, dtype=torch.float64))

@@ -24,6 +24,9 @@ class Spline(nn.Module):
         knots: number of knots M, from 4 to K + 1.
     """
 
+    _rows: Tensor
+    _knots: Tensor
+
     def __init__(self, *, horizon: int, knots: int) -> None:
         super().__init__()
         if not 4 <= knots <= horizon + 1:

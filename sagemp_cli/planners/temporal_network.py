@@ -33,6 +33,8 @@ class TemporalNetwork(nn.Module):
         frequencies: features of the generative time.
     """
 
+    angles: Tensor
+
     def __init__(
         self, inputs: int, outputs: int, *, condition: int, width: int = 64, kernel: int = 3, frequencies: int = 8
     ) -> None:

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 
@@ -97,7 +98,9 @@ def headline(figure: Figure, text: str, subtitle: str, *, colour: str = INK) -> 
     """What the figure says, and under which conditions: at the top left, the conditions wrapped to its width."""
     lines = textwrap.wrap(subtitle, int(12.6 * figure.get_figwidth()))
     height = figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0.004, 0.004, 0.988, 0.996 - (0.44 + 0.18 * len(lines)) / height))
+    layout = figure.get_layout_engine()
+    assert isinstance(layout, ConstrainedLayoutEngine)
+    layout.set(rect=(0.004, 0.004, 0.988, 0.996 - (0.44 + 0.18 * len(lines)) / height))
     top = 1 - 0.12 / height
     figure.text(0.012, top, text, ha="left", va="top", fontsize=14, fontweight="bold", color=colour)
     below = top - 0.27 / height
@@ -133,15 +136,15 @@ def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
     axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.4, zorder=1))
     for obstacle in scene.obstacles:
         if isinstance(obstacle, Ball):
-            center = obstacle.center[:2]
+            center = _point(obstacle.center)
             axes.add_patch(Circle(center, obstacle.radius, facecolor=OBSTACLE, edgecolor="none", zorder=2))
         else:
-            center = [0.5 * (a + b) for a, b in zip(obstacle.lower[:2], obstacle.upper[:2], strict=True)]
+            center = _point([0.5 * (a + b) for a, b in zip(obstacle.lower, obstacle.upper, strict=True)])
             axes.add_patch(_box(obstacle.lower, obstacle.upper, facecolor=OBSTACLE, edgecolor="none", zorder=2))
         if names:
             axes.annotate(obstacle.name, center, ha="center", va="center", fontsize=7.5, color="white", zorder=2.5)
     for landmark in scene.landmarks:
-        center = landmark.center[:2]
+        center = _point(landmark.center)
         outline = {"fill": False, "edgecolor": MUTED, "linewidth": 1.1, "linestyle": (0, (2, 2))}
         axes.add_patch(Circle(center, landmark.radius, zorder=2, **outline))
         if names:
@@ -171,11 +174,11 @@ def draw_paths(axes: Axes, paths: np.ndarray, **options: Any) -> None:
 
 def draw_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, **options: Any) -> None:
     """Boxes ``(count, 2)`` as one collection; infinite ones are left out."""
-    finite = np.isfinite(lower).all(-1) & np.isfinite(upper).all(-1)
+    finite = np.asarray(np.isfinite(lower).all(-1) & np.isfinite(upper).all(-1))
     (left, bottom), (right, top) = np.asarray(lower)[finite].T, np.asarray(upper)[finite].T
     corners = np.stack([left, bottom, right, bottom, right, top, left, top], axis=-1).reshape(-1, 4, 2)
     options = {k: v[finite] if isinstance(v, np.ndarray) and len(v) == len(finite) else v for k, v in options.items()}
-    axes.add_collection(PolyCollection(corners, **options), autolim=False)
+    axes.add_collection(PolyCollection(list(corners), **options), autolim=False)
 
 
 def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
@@ -183,7 +186,7 @@ def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
     size = (setting.scene.workspace.upper - setting.scene.workspace.lower).numpy()
     position = list(setting.dynamics.position)
     with np.errstate(invalid="ignore", over="ignore"):
-        fits = (upper[..., position] - lower[..., position] <= size).all(-1).all(0)
+        fits = np.asarray((upper[..., position] - lower[..., position] <= size).all(-1).all(0))
     return len(fits) if fits.all() else int(fits.argmin())
 
 
@@ -242,12 +245,17 @@ def legend_above(axes: Axes, handles: Sequence[Any]) -> None:
     )
 
 
-def _name(axes: Axes, text: str, at: Sequence[float], offset: Sequence[float], **options: Any) -> None:
+def _point(place: Sequence[float]) -> tuple[float, float]:
+    """The first two coordinates."""
+    return float(place[0]), float(place[1])
+
+
+def _name(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **options: Any) -> None:
     """The name of a thing, on top of everything; ``offset`` in points."""
     axes.annotate(text, at, offset, textcoords="offset points", zorder=9, bbox=_PLATE, **options)
 
 
-def _box(lower: Sequence[float], upper: Sequence[float], **options: Any) -> Rectangle:
+def _box(lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray, **options: Any) -> Rectangle:
     return Rectangle(
         (float(lower[0]), float(lower[1])), float(upper[0] - lower[0]), float(upper[1] - lower[1]), **options
     )

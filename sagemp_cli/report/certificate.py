@@ -9,6 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d import Axes3D
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.report.canvas import (
@@ -59,10 +60,10 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     if flat:
         draw_scene(scene, setting)
     for r in range(count):
-        if flat:
-            draw_tube(scene, setting, tubes, r)
-        else:
+        if isinstance(scene, Axes3D):
             space_tube(scene, setting, tubes, r)
+        else:
+            draw_tube(scene, setting, tubes, r)
     for example in record.counterexamples:
         path = example.states[:, list(dynamics.position)]
         scene.plot(*path.T, color=DANGER, linewidth=1.6, zorder=8)
@@ -141,7 +142,7 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
         around = np.concatenate([lower, upper[:, ::-1]], axis=1)
         outlines = np.stack([np.broadcast_to(across, around.shape), around], axis=-1)
         alpha = 0.15 / np.sqrt(max(1, len(lower) / 9))
-        axes.add_collection(PolyCollection(outlines, color=colour, alpha=alpha, linewidth=0), autolim=False)
+        axes.add_collection(PolyCollection(list(outlines), color=colour, alpha=alpha, linewidth=0), autolim=False)
         axes.plot(times[:steps], lower.min(0), color=colour, linewidth=0.9)
         axes.plot(times[:steps], upper.max(0), color=colour, linewidth=0.9)
     if steps < len(times):

@@ -59,7 +59,7 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
                 axes.axhline(limit, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
         axes.autoscale_view()
         axes.set_xlim(0, dynamics.dt * horizon)
-    axes.set_xlabel("time (s)", fontsize=9.5)
+    figure.axes[-1].set_xlabel("time (s)", fontsize=9.5)
     headline(
         figure,
         f"{count} demonstrations",

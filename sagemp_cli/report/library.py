@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from sagemp_cli.report.canvas import (
     DANGER,
@@ -66,7 +67,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
     axes.set_yticks(range(len(names)), names, fontsize=9, color=INK)
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     for i, value in enumerate(values):
         axes.annotate(str(value), (value, i), (4, 0), textcoords="offset points", va="center", fontsize=9, color=MUTED)
     axes.set_xlim(0, 1.15 * max(values))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -78,6 +79,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
         goal_at_end(axes, setting, i, times[-1])
     figure.align_ylabels(panels)
     tracked = np.unique(chosen)
+    handles: list[Artist]
     if len(tracked) <= NAMED:
         handles = [Line2D([], [], color=MODES[i % len(MODES)], lw=2, label=f"tracks {i}") for i in tracked]
     else:

@@ -73,13 +73,14 @@ def safety_rows(artifact: Artifact[SafetyRates]) -> tuple[SafetyRow, SafetyRow, 
 
     everyone = np.ones(len(record.references), dtype=bool)
     ways = ((OPEN_LOOP, record.open_loop), (CLOSED_LOOP, record.closed_loop))
-    executed = (row(way, t, everyone, always_safe(t), always_safe(t) & t.reached.all((1, 2))) for way, t in ways)
-    return (*executed, row(CERTIFIED, record.closed_loop, proved, proved, proved))
+    executed = [row(way, t, everyone, always_safe(t), always_safe(t) & t.reached.all((1, 2))) for way, t in ways]
+    opened, closed = executed
+    return (opened, closed, row(CERTIFIED, record.closed_loop, proved, proved, proved))
 
 
 def always_safe(trials: Trials) -> np.ndarray:
     """Whether all rollouts of a reference stayed in the safe set, ``(count,)``."""
-    return (trials.clearance > 0).all((1, 2))
+    return np.asarray((trials.clearance > 0).all((1, 2)))
 
 
 def certified(record: SafetyRates) -> np.ndarray:

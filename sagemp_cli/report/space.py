@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,10 +26,11 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
     axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
     low, high = setting.scene.workspace.lower.numpy(), setting.scene.workspace.upper.numpy()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.03)
+    axes.set_box_aspect(high - low, zoom=1.03)  # pyright: ignore[reportArgumentType]  (declared as a whole number)
     axes.view_init(elev=24, azim=-62)
     labels = [setting.label(i) for i in setting.dynamics.position]
-    for axis, label in zip((axes.xaxis, axes.yaxis, axes.zaxis), labels, strict=True):
+    sides: tuple[Any, ...] = (axes.xaxis, axes.yaxis, axes.zaxis)  # Matplotlib declares the axes of the plane for these
+    for axis, label in zip(sides, labels, strict=True):
         axis.set_pane_color("white")
         axis.line.set_color(MUTED)
         axis.set_label_text(label, fontsize=9.5, color=INK)
@@ -42,12 +44,13 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
             faces = box_faces(np.array([obstacle.lower]), np.array([obstacle.upper]))
             axes.add_collection3d(Poly3DCollection(faces, facecolor=OBSTACLE, edgecolor="white", linewidth=0.3))
             at = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
-        axes.text(*at, obstacle.name, color="white", fontsize=8, ha="center", va="center", zorder=2.5)
+        axes.text(at[0], at[1], at[2], obstacle.name, color="white", fontsize=8, ha="center", va="center", zorder=2.5)
     index = list(setting.dynamics.position)
     goal = [np.clip(v.numpy()[index], low, high) for v in (setting.scene.goal.lower, setting.scene.goal.upper)]
     faces = box_faces(goal[0][None], goal[1][None])
     axes.add_collection3d(Poly3DCollection(faces, facecolor=GOAL, alpha=0.1, edgecolor=GOAL, linewidth=1.3, zorder=6))
-    axes.text(*(0.5 * (goal[0] + goal[1]))[:2], goal[1][2] + 0.12, "goal", color=GOAL, fontsize=9, fontweight="bold")
+    middle = 0.5 * (goal[0] + goal[1])
+    axes.text(middle[0], middle[1], goal[1][2] + 0.12, "goal", color=GOAL, fontsize=9, fontweight="bold")
     return axes
 
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sagemp_cli.report.canvas import INK, MODES, MUTED, blank_figure, headline, legend, style_axes
-from sagemp_cli.storage import Artifact, PlannerModel, TrackerModel
+from sagemp_cli.storage import Artifact, DynamicsModel, PlannerModel, TrackerModel
 
 _VALIDATION = "validation "
 
@@ -36,7 +36,9 @@ def draw_training(artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> 
     return figure
 
 
-def draw_losses(axes: Axes, artifact: Artifact[PlannerModel] | Artifact[TrackerModel]) -> None:
+def draw_losses(
+    axes: Axes, artifact: Artifact[DynamicsModel] | Artifact[PlannerModel] | Artifact[TrackerModel]
+) -> None:
     """What every update measured and is positive, on a logarithmic axis."""
     curve = artifact.record.curve
     style_axes(axes, xlabel="update", ylabel="loss")

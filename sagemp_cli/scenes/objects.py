@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating]
 Colour = tuple[int, int, int]
 Shape = Callable[[Array, Array], Array]
 
@@ -26,7 +26,7 @@ class Layer:
 
 
 def _disc(x: float, y: float, radius: float) -> Shape:
-    return lambda u, v: np.hypot(u - x, v - y) - radius
+    return lambda u, v: np.hypot(u - x, v - y) - np.float32(radius)
 
 
 def _bar(x: float, y: float, half_width: float, half_height: float) -> Shape:

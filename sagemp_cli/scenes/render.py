@@ -48,7 +48,7 @@ def render(
         _draw(canvas, thing, frame)
     if dots:
         for place, colour in ((start, START), (goal, GOAL)):
-            canvas.disc(frame.to_image(np.asarray(place[:2], dtype=np.float64)), DOT, colour)
+            canvas.disc(frame.to_image(np.asarray(place[:2], dtype=np.float64)).tolist(), DOT, colour)
     return np.rint(canvas.pixels).astype(np.uint8)
 
 
@@ -109,11 +109,11 @@ class _Canvas:
 
 def _draw(canvas: _Canvas, thing: Obstacle | Landmark, frame: Frame) -> None:
     if isinstance(thing, Ball | Landmark):
-        center, radius = frame.to_image(np.array(thing.center)), thing.radius / frame.scale
+        center, radius = frame.to_image(np.array(thing.center)).tolist(), thing.radius / frame.scale
         canvas.disc(center, radius, PLATE if thing.object else PLAIN)
     else:
         low, high = frame.to_image(np.array([thing.lower, thing.upper]))
         canvas.rectangle(low, high, PLATE if thing.object else PLAIN)
-        center, radius = 0.5 * (low + high), 0.5 * float((high - low).min())
+        center, radius = (0.5 * (low + high)).tolist(), 0.5 * float((high - low).min())
     if thing.object:
         canvas.drawing(thing.object, center, radius)

@@ -214,6 +214,7 @@ class Run(Protocol):
 
     def __call__(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, CellTubes]]:
         """In any order."""
+        ...
 
 
 class Pieces(Protocol):
@@ -222,9 +223,11 @@ class Pieces(Protocol):
     @property
     def finished(self) -> Collection[int]:
         """Indices of the chunks that are there."""
+        ...
 
     def load(self, index: int) -> Mapping[str, np.ndarray]:
         """What :meth:`save` was given."""
+        ...
 
     def save(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep a finished chunk."""

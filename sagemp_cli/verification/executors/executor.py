@@ -19,3 +19,4 @@ class Executor(Protocol):
 
     def opened(self, prover: CellProver) -> AbstractContextManager[Run]:
         """Ready to prove chunks as often as wanted; whatever was started for that is ended when the context is left."""
+        ...
