@@ -1,4 +1,4 @@
-"""Reading a certificate or a library with h5py alone: the file is untrusted input, and everything in it is checked."""
+"""Reading a certificate or a library: the file is untrusted input, and everything in it is checked."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import yaml
 
 from sagemp_cli.checker.cell import Policy
-from sagemp_cli.checker.limits import require_readable
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reading.plain_yaml import plain_yaml
+from sagemp_cli.reading.reader import read_tree
+from sagemp_cli.reading.tree import Dataset, Group
 from sagemp_cli.storage.content import ContentError, content_hash
-from sagemp_cli.storage.plain_yaml import plain_yaml
 
 KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
 """Schemas that can be checked, with the newest version of their format that is known here."""
@@ -64,18 +64,14 @@ def read_document(path: Path) -> Document:
         ArtifactError: missing, not HDF5, of another kind, of a newer format, changed since it was written, or with
             anything missing or of the wrong type or shape.
     """
-    if not path.is_file():
-        raise ArtifactError(f"{path}: {'is a folder, a file is needed' if path.is_dir() else 'no such file'}")
     try:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            require_readable(file, path.stat().st_size)
-            return _read(file, path)
+        tree, _ = read_tree(path, what="a file", damaged="not a certificate, or a damaged one")
+        return _read(tree, path)
     except ArtifactError:
         raise
     except ContentError as e:
         raise ArtifactError(f"{path}: {e}") from None
     except (
-        OSError,
         LookupError,
         RuntimeError,
         TypeError,
@@ -89,7 +85,7 @@ def read_document(path: Path) -> Document:
         raise ArtifactError(f"{path}: not a certificate, or a damaged one ({' '.join(str(e).split())})") from None
 
 
-def _read(file: h5py.File, path: Path) -> Document:
+def _read(file: Group, path: Path) -> Document:
     schema = str(file.attrs.get("schema", ""))
     if schema not in KINDS:
         raise ArtifactError(f"{path}: is '{schema or 'no artifact'}'; only {' and '.join(KINDS)} can be checked")
@@ -103,7 +99,7 @@ def _read(file: h5py.File, path: Path) -> Document:
         raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
     if content_hash(file) != stored:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
-    config = _config(file["config"].asstr()[()])
+    config = _config(file["config"][()])
     data = file["data"]
     weights = {name: _dataset(d) for name, d in data["tracker"].items()}
     examples = data.get("counterexamples", {})
@@ -144,9 +140,9 @@ def _arguments(text: str) -> Any:
     return arguments
 
 
-def _tubes(tubes: h5py.Group, path: Path) -> dict[str, Any]:
+def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
     """What a group of tubes holds, as fields of a :class:`Document`."""
-    read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], h5py.Dataset)}
+    read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], Dataset)}
     _require_shapes(read, path)
     relaxations, operations = {}, ()
     if "relaxations" in tubes:
@@ -163,10 +159,8 @@ def _tubes(tubes: h5py.Group, path: Path) -> dict[str, Any]:
     }
 
 
-def _dataset(dataset: h5py.Dataset) -> Any:
-    if h5py.check_string_dtype(dataset.dtype) is not None:
-        return [str(v) for v in dataset.asstr()[()]]
-    return np.asarray(dataset[()])
+def _dataset(dataset: Dataset) -> Any:
+    return list(dataset[()]) if dataset.dtype.kind == "O" else np.asarray(dataset[()])
 
 
 _SHAPES = {

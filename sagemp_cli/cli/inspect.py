@@ -30,10 +30,9 @@ def inspect(
     Everything is read and checked against the declaration of its kind; the content and the files that it was made
     from are compared by hash.
     """
-    from sagemp_cli.storage import open_header, read_artifact
+    from sagemp_cli.storage import read_any_artifact
 
-    kind, _ = open_header(file)
-    artifact = read_artifact(file, kind.record)
+    kind, artifact = read_any_artifact(file)
     content = describe(kind, artifact)
     if as_json:
         typer.echo(json.dumps(content, indent=2))
@@ -49,7 +48,7 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
         "kind": kind.name,
         "format": kind.version,
         "sha256": artifact.sha256,
-        "content": _content(artifact.path),
+        "content": "as it was written" if artifact.unchanged else "CHANGED since it was written (its hash differs)",
         "stage": header.stage,
         "experiment": header.experiment,
         "seed": header.seed,
@@ -67,23 +66,11 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
     }
 
 
-def _content(path: Path) -> str:
-    """Whether the stored hash of the content is still that of the content; it finds accidents, no forgers."""
-    import h5py
-
-    from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
-
-    with h5py.File(path, "r") as file:
-        same = str(file.attrs.get(HASH_ATTRIBUTE, "")) == content_hash(file)
-    return "as it was written" if same else "CHANGED since it was written (its hash differs)"
-
-
 def _now(path: Path, sha256: str) -> str:
-    from sagemp_cli.storage import sha256_of
+    from sagemp_cli.reading.regular import sha256_if_there
 
-    if not path.is_file():
-        return "not there"
-    return "unchanged" if sha256_of(path) == sha256 else "changed since"
+    found = sha256_if_there(path)
+    return "not there" if found is None else "unchanged" if found == sha256 else "changed since"
 
 
 def _fields(record: Any, prefix: str) -> list[dict[str, str]]:

@@ -6,7 +6,7 @@ caller deletes it when the work is done. It holds plain arrays only, so reading 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,9 @@ import h5py
 import numpy as np
 
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.storage.atomic import hdf5_image, reason_of, write_whole
+from sagemp_cli.reading.reader import read_tree
+from sagemp_cli.reading.tree import Group
+from sagemp_cli.storage.atomic import hdf5_image, write_whole
 
 _SCHEMA = "sagemp-checkpoint-1"
 
@@ -55,23 +57,23 @@ def read_checkpoint(path: Path, *, identity: str) -> Checkpoint:
         ArtifactError: the file is damaged, no checkpoint, or belongs to work of another ``identity``.
     """
     try:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            schema, found = file.attrs.get("schema"), file.attrs.get("identity")
-            arrays: dict[str, np.ndarray] = {}
-
-            def collect(name: str, node: h5py.Group | h5py.Dataset) -> None:
-                if isinstance(node, h5py.Dataset):
-                    arrays[name] = node[()]
-
-            file.visititems(collect)
-    except (OSError, RuntimeError, KeyError) as error:
-        raise ArtifactError(
-            f"cannot read the checkpoint {path} ({reason_of(error)}); delete it to start over"
-        ) from None
+        file, _ = read_tree(path)
+    except ArtifactError as error:
+        why = str(error).removeprefix(f"{path}: ")
+        raise ArtifactError(f"cannot read the checkpoint {path} ({why}); delete it to start over") from None
+    schema, found = file.attrs.get("schema"), file.attrs.get("identity")
     if schema != _SCHEMA:
         raise ArtifactError(f"{path} is not a checkpoint (schema {schema!r}, expected '{_SCHEMA}')")
     if found != identity:
         raise ArtifactError(
             f"the checkpoint {path} belongs to other work ('{found}', expected '{identity}'); delete it to start over"
         )
-    return Checkpoint(identity, arrays)
+    return Checkpoint(identity, dict(_arrays(file)))
+
+
+def _arrays(group: Group, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    for name, node in group.items():
+        if isinstance(node, Group):
+            yield from _arrays(node, f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", node[()]

@@ -17,6 +17,7 @@ from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.reading.regular import is_there, sha256_if_there
 from sagemp_cli.storage import Artifact, Header, Parent, read_artifact, sha256_of, write_artifact
 
 
@@ -98,7 +99,7 @@ class StageContext:
                 )
             return artifact
         made_by, path = stage_named(stage), self.output_path(stage)
-        if not path.exists():
+        if not is_there(path):
             raise ArtifactError(
                 f"{path}: missing; make it with 'sagemp {stage} experiment={self.config['name']}'"
                 f" (or 'sagemp run', which makes everything that is missing)"
@@ -113,9 +114,8 @@ class StageContext:
             )
         for parent in artifact.header.parents:
             source = self.folder / parent.path
-            if not source.exists():
-                continue  # an input that is gone cannot contradict what was made from it
-            if sha256_of(source) != parent.sha256:
+            # An input that is gone cannot contradict what was made from it.
+            if sha256_if_there(source) not in (None, parent.sha256):
                 raise ArtifactError(
                     f"{path}: was made from an earlier {source}, which has changed since; "
                     f"remake it with 'sagemp {stage} --overwrite'"

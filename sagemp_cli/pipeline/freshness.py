@@ -14,6 +14,7 @@ from pathlib import Path
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.stage import STAGES, Stage, stages_of
+from sagemp_cli.reading.regular import is_there, sha256_if_there
 from sagemp_cli.storage import Header, open_header, sha256_of
 from sagemp_cli.storage.kinds import KINDS
 
@@ -65,7 +66,7 @@ def survey(context: StageContext, *, last: str | None = None) -> dict[str, FileS
 
 def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileState]) -> FileState:
     path = context.output_path(stage.name)
-    if not path.exists():
+    if not is_there(path):
         return FileState(stage, path, Freshness.MISSING, f"make it with 'sagemp {stage.name}'")
     try:
         kind, header = open_header(path)
@@ -105,6 +106,6 @@ def _file_change(header: Header, context: StageContext) -> str:
     for parent in header.parents:
         source = context.folder / parent.path
         foreign = parent.role not in {stage.role for stage in STAGES}
-        if foreign and source.exists() and sha256_of(source) != parent.sha256:
+        if foreign and sha256_if_there(source) not in (None, parent.sha256):
             return f"{source.name} has changed since"
     return ""

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from sagemp_cli import __version__
-from sagemp_cli.errors import ResourceError
+from sagemp_cli.errors import ArtifactError, ResourceError
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.stage import stage_named
+from sagemp_cli.reading.reader import read_arrays
 from sagemp_cli.storage import Artifact, Parent
 
 Inputs = Sequence[Artifact[Any] | Parent]
@@ -79,11 +79,13 @@ class PartialResults:
         """
         path = self._path(index)
         try:
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError) as e:
+            return read_arrays(path)[1]
+        except ArtifactError as e:
             path.unlink(missing_ok=True)
-            raise ResourceError(f"{path}: damaged piece, deleted; run the stage again to make it anew ({e})") from None
+            why = str(e).removeprefix(f"{path}: ")
+            raise ResourceError(
+                f"{path}: damaged piece, deleted; run the stage again to make it anew ({why})"
+            ) from None
 
     def remove(self) -> None:
         """Remove all pieces: the stage's output is written."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ArtifactError, UsageError
-from sagemp_cli.planners.trajectory_file import REFERENCES, names_in, read_arrays
+from sagemp_cli.planners.trajectory_file import REFERENCES, arrays_in
 from sagemp_cli.verification.verification import require_finite
 
 
@@ -29,9 +29,11 @@ def read_references(path: Path, *, horizon: int, state_names: Sequence[str]) -> 
         UsageError: wrong shape or horizon.
         NonFiniteError: a NaN or an infinity.
     """
-    array, n = read_arrays(path, (REFERENCES,)).get(REFERENCES), len(state_names)
+    (names, arrays), n = arrays_in(path, (REFERENCES,)), len(state_names)
+    array = arrays.get(REFERENCES)
     if array is None:
-        raise ArtifactError(f"{path}: has no dataset '{REFERENCES}'; found: {', '.join(names_in(path)) or 'nothing'}")
+        found = ", ".join(names[:20]) + ", ..." * (len(names) > 20)
+        raise ArtifactError(f"{path}: has no dataset '{REFERENCES}'; found: {found or 'nothing'}")
     if array.ndim != 3 or array.shape[-1] != n or not len(array):
         raise UsageError(f"{path}: references must have shape (count, {horizon + 1}, {n}), found {array.shape}")
     if array.shape[1] != horizon + 1:

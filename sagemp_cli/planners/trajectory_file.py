@@ -14,16 +14,17 @@ States may be missing except for the position; the time may be missing where row
 from __future__ import annotations
 
 import csv
-import zipfile
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from sagemp_cli.errors import ArtifactError, did_you_mean
+from sagemp_cli.reading.reader import read_arrays
+from sagemp_cli.reading.regular import require_regular
 
 REFERENCES = "references"
 """Name of the dataset that holds all states at once."""
@@ -31,6 +32,8 @@ TIME = "t"
 LABEL = "trajectory"
 
 _HDF5 = (".h5", ".hdf5")
+_LARGEST_CSV = 2**26
+_LARGEST = 1e9
 
 Array = NDArray[np.float64]
 
@@ -55,34 +58,23 @@ class RecordedTrajectory:
         return len(next(iter(self.states.values())))
 
 
-def read_arrays(path: Path, wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-    """The datasets of real numbers at the top of an HDF5 (.h5, .hdf5) or NPZ (.npz) file, by name.
+def arrays_in(path: Path, wanted: Iterable[str] | None = None) -> tuple[list[str], dict[str, np.ndarray]]:
+    """What is at the top of an HDF5 (.h5, .hdf5) or NPZ (.npz) file: names, and arrays of real numbers by name.
 
     Args:
         path: the file.
         wanted: names to read, where they are there; all if not given.
 
     Raises:
-        ArtifactError: another kind of file, missing, unreadable, or a wanted dataset is not of real numbers.
+        ArtifactError: another kind of file, missing, unreadable, or a wanted one is not of real numbers.
     """
-    suffix = path.suffix.lower()
-    if suffix not in (*_HDF5, ".npz"):
+    if path.suffix.lower() not in (*_HDF5, ".npz"):
         raise ArtifactError(f"{path}: a file of references must be HDF5 ({', '.join(_HDF5)}) or NPZ (.npz)")
-    if not path.is_file():
-        raise ArtifactError(f"{path}: no such file")
-    try:
-        return _from_hdf5(path, wanted) if suffix in _HDF5 else _from_npz(path, wanted)
-    except (OSError, ValueError, KeyError, RuntimeError, EOFError, zipfile.BadZipFile) as e:
-        raise ArtifactError(f"{path}: cannot be read ({' '.join(str(e).split())})") from None
-
-
-def names_in(path: Path) -> list[str]:
-    """Names of what is at the top of an HDF5 or NPZ file that :func:`read_arrays` can read."""
-    if path.suffix.lower() in _HDF5:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            return list(file)
-    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        return list(file.files)
+    names, arrays = read_arrays(path, None if wanted is None else list(wanted))
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise ArtifactError(f"{path}: '{name}' must hold real numbers, found type {array.dtype}")
+    return names, arrays
 
 
 def read_trajectories(path: Path, *, state_names: Sequence[str]) -> list[RecordedTrajectory]:
@@ -95,41 +87,14 @@ def read_trajectories(path: Path, *, state_names: Sequence[str]) -> list[Recorde
     suffix = path.suffix.lower()
     if suffix not in (*_HDF5, ".npz", ".csv"):
         raise ArtifactError(f"{path}: trajectories must be in HDF5 ({', '.join(_HDF5)}), NPZ (.npz) or CSV (.csv)")
-    if not path.is_file():
-        raise ArtifactError(f"{path}: no such file")
     found = _from_csv(path, state_names) if suffix == ".csv" else _from_arrays(path, state_names)
     for trajectory in found:
         _require_sound(path, trajectory)
     return found
 
 
-def _from_hdf5(path: Path, wanted: Iterable[str] | None) -> dict[str, np.ndarray]:
-    with h5py.File(path, "r", locking="best-effort") as file:
-        names = [name for name in (file if wanted is None else wanted) if name in file]
-        for name in names:
-            if not isinstance(file[name], h5py.Dataset):
-                raise ArtifactError(f"{path}: '{name}' is a group; a dataset of numbers is expected there")
-            _require_real(path, name, file[name].dtype)
-        return {name: file[name][()] for name in names}
-
-
-def _from_npz(path: Path, wanted: Iterable[str] | None) -> dict[str, np.ndarray]:
-    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ArtifactError(f"{path}: is no NPZ archive, though its name says so")
-        arrays = {name: file[name] for name in (file.files if wanted is None else wanted) if name in file.files}
-    for name, array in arrays.items():
-        _require_real(path, name, array.dtype)
-    return arrays
-
-
-def _require_real(path: Path, name: str, dtype: np.dtype) -> None:
-    if dtype.kind not in "fiu":
-        raise ArtifactError(f"{path}: '{name}' must hold real numbers, found type {dtype}")
-
-
 def _from_arrays(path: Path, state_names: Sequence[str]) -> list[RecordedTrajectory]:
-    arrays = {name: np.asarray(array, dtype=np.float64) for name, array in read_arrays(path).items()}
+    arrays = {name: np.asarray(array, dtype=np.float64) for name, array in arrays_in(path)[1].items()}
     time = arrays.pop(TIME, None)
     if REFERENCES in arrays:
         table = arrays.pop(REFERENCES)
@@ -165,6 +130,11 @@ def _from_arrays(path: Path, state_names: Sequence[str]) -> list[RecordedTraject
 
 
 def _from_csv(path: Path, state_names: Sequence[str]) -> list[RecordedTrajectory]:
+    size = require_regular(path)
+    if size > _LARGEST_CSV:
+        raise ArtifactError(
+            f"{path}: has {size >> 20} MiB; a CSV may have {_LARGEST_CSV >> 20} MiB, HDF5 and NPZ hold more"
+        )
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             table = [(i, row) for i, row in enumerate(csv.reader(file), start=1) if row]
@@ -173,9 +143,8 @@ def _from_csv(path: Path, state_names: Sequence[str]) -> list[RecordedTrajectory
     if not table:
         raise ArtifactError(f"{path}: is empty; a header with {TIME} and state names is expected")
     header = [name.strip() for name in table[0][1]]
-    twice = next((name for name in header if header.count(name) > 1), None)
-    if twice is not None:
-        raise ArtifactError(f"{path}: has two columns '{twice}'")
+    if len(set(header)) < len(header):
+        raise ArtifactError(f"{path}: has two columns '{Counter(header).most_common(1)[0][0]}'")
     numbers = [name for name in header if name != LABEL]
     _require_known(path, [n for n in numbers if n != TIME], state_names, beside=(TIME, LABEL))
     groups: dict[str, list[list[float]]] = {}
@@ -219,6 +188,9 @@ def _require_sound(path: Path, trajectory: RecordedTrajectory) -> None:
         if values is not None and not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
             raise ArtifactError(f"{where} has {name} = {values[row]} in row {row}; numbers must be finite")
+        if name != TIME and (np.abs(values) > _LARGEST).any():
+            row = int(np.argmax(np.abs(values) > _LARGEST))
+            raise ArtifactError(f"{where} has {name} = {values[row]:g} in row {row}; at most {_LARGEST:g} is allowed")
     if trajectory.time is not None and not (np.diff(trajectory.time) > 0).all():
         row = int(np.argmin(np.diff(trajectory.time) > 0)) + 1
         before, now = trajectory.time[row - 1], trajectory.time[row]

@@ -1,12 +1,13 @@
 """Artifacts in HDF5: typed records, provenance, atomic writes."""
 
+from sagemp_cli.reading.regular import sha256_of
 from sagemp_cli.storage.artifact import (
     Artifact,
     Header,
     Parent,
     open_header,
+    read_any_artifact,
     read_artifact,
-    sha256_of,
     write_artifact,
 )
 from sagemp_cli.storage.atomic import hdf5_image, refuse_existing, write_whole
@@ -51,6 +52,7 @@ __all__ = [
     "Tubes",
     "hdf5_image",
     "open_header",
+    "read_any_artifact",
     "read_artifact",
     "refuse_existing",
     "sha256_of",

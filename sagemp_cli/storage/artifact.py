@@ -8,7 +8,6 @@ overwritten unless asked for. On reading it is untrusted input: whatever does no
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -23,26 +22,27 @@ import yaml
 
 from sagemp_cli import __version__
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reading.plain_json import plain_mapping
+from sagemp_cli.reading.plain_yaml import plain_yaml
+from sagemp_cli.reading.reader import read_tree
+from sagemp_cli.reading.tree import Group
 from sagemp_cli.storage.atomic import hdf5_image, reason_of, refuse_existing, write_whole
-from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
+from sagemp_cli.storage.content import HASH_ATTRIBUTE, ContentError, content_hash
 from sagemp_cli.storage.kinds import KINDS, Kind, kind_of
-from sagemp_cli.storage.plain_yaml import plain_yaml
 from sagemp_cli.storage.record import group_of, read_record, write_record
 
 R = TypeVar("R")
 _PACKAGES = ("torch", "numpy", "scipy", "h5py", "hydra-core")
 _DAMAGE = (
-    OSError,
     LookupError,
     RuntimeError,
     TypeError,
     ValueError,
     AttributeError,
     ArithmeticError,
-    MemoryError,
     yaml.YAMLError,
 )
-"""What the HDF5, YAML and JSON readers raise on damaged files; a SagempError is none of them."""
+"""What reading fields, YAML and JSON of a damaged file raises; a SagempError is none of them."""
 
 
 @dataclass(frozen=True)
@@ -89,22 +89,23 @@ class Header:
 
 @dataclass(frozen=True)
 class Artifact(Generic[R]):
-    """A file that was read: where, its hash, its header and its record."""
+    """A file that was read: where, its hash, its header and its record.
+
+    Attributes:
+        path, sha256: the file, and the hash of the bytes that were read.
+        header, record: what is in it.
+        unchanged: whether its content is still what was written, by the hash in it; it finds accidents, no forgers.
+    """
 
     path: Path
     sha256: str
     header: Header
     record: R
+    unchanged: bool = True
 
     def as_parent(self, role: str, beside: Path) -> Parent:
         """This artifact as a parent of one that is written in the folder ``beside``."""
         return Parent(role, os.path.relpath(self.path, beside), self.sha256)
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
-    with path.open("rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def write_artifact(path: Path, record: Any, header: Header, *, overwrite: bool = False) -> Path:
@@ -133,36 +134,41 @@ def read_artifact(path: Path, record: type[R]) -> Artifact[R]:
         ArtifactError: missing, not HDF5, cut off, of another kind, of a newer format, or not as declared.
         NonFiniteError: NaN or infinity where the declaration allows none.
     """
-    found = open_header(path)
-    kind = next(k for k in KINDS if k.record is record)
-    if found[0].name != kind.name:
-        raise ArtifactError(f"{path}: is an artifact of kind '{found[0].name}', '{kind.name}' is needed here")
-    with _open(path) as file:
-        try:
-            body = read_record(group_of(file, "data", f"{path}: /data"), record, str(path))
-        except _DAMAGE as e:
-            raise ArtifactError(f"{path}: damaged HDF5 data ({reason_of(e)})") from e
-    return Artifact(path, sha256_of(path), found[1], body)
+    wanted, (tree, sha256) = next(k for k in KINDS if k.record is record), read_tree(path)
+    kind, header = _header(tree, path)
+    if kind is not wanted:
+        raise ArtifactError(f"{path}: is an artifact of kind '{kind.name}', '{wanted.name}' is needed here")
+    return _artifact(path, sha256, kind, header, tree)
+
+
+def read_any_artifact(path: Path) -> tuple[Kind, Artifact[Any]]:
+    """Read a file as an artifact of the kind that it says it is of, see :func:`read_artifact`."""
+    tree, sha256 = read_tree(path)
+    kind, header = _header(tree, path)
+    return kind, _artifact(path, sha256, kind, header, tree)
+
+
+def _artifact(path: Path, sha256: str, kind: Kind, header: Header, tree: Group) -> Artifact[Any]:
+    try:
+        body = read_record(group_of(tree, "data", f"{path}: /data"), kind.record, str(path))
+        unchanged = tree.attrs.get(HASH_ATTRIBUTE) == content_hash(tree)
+    except ContentError as e:
+        raise ArtifactError(f"{path}: {e}") from e
+    except _DAMAGE as e:
+        raise ArtifactError(f"{path}: damaged HDF5 data ({reason_of(e)})") from e
+    return Artifact(path, sha256, header, body, unchanged)
 
 
 def open_header(path: Path) -> tuple[Kind, Header]:
     """The kind and provenance of any artifact, without reading its data."""
-    with _open(path) as file:
-        try:
-            return _read_header(file, path)
-        except _DAMAGE as e:
-            raise ArtifactError(f"{path}: not an artifact of sagemp, or a damaged one ({reason_of(e)})") from e
+    return _header(read_tree(path, without=("data",))[0], path)
 
 
-def _open(path: Path) -> h5py.File:
-    if not path.exists():
-        raise ArtifactError(f"{path}: no such file")
-    if path.is_dir():
-        raise ArtifactError(f"{path}: is a folder, an HDF5 file is needed")
+def _header(tree: Group, path: Path) -> tuple[Kind, Header]:
     try:
-        return h5py.File(path, "r", locking="best-effort")
-    except OSError as e:
-        raise ArtifactError(f"{path}: not a readable HDF5 file ({reason_of(e)})") from e
+        return _read_header(tree, path)
+    except _DAMAGE as e:
+        raise ArtifactError(f"{path}: not an artifact of sagemp, or a damaged one ({reason_of(e)})") from e
 
 
 def _write_header(file: h5py.File, kind: Kind, header: Header) -> None:
@@ -191,7 +197,7 @@ def _write_header(file: h5py.File, kind: Kind, header: Header) -> None:
         node.attrs["sha256"] = parent.sha256
 
 
-def _read_header(file: h5py.File, path: Path) -> tuple[Kind, Header]:
+def _read_header(file: Group, path: Path) -> tuple[Kind, Header]:
     schema = str(file.attrs.get("schema", ""))
     known = {f"sagemp/{k.name}": k for k in KINDS}
     if schema not in known:
@@ -207,23 +213,29 @@ def _read_header(file: h5py.File, path: Path) -> tuple[Kind, Header]:
         )
     if "data" not in file:
         raise ArtifactError(f"{path}: group /data is missing")
-    config = plain_yaml(file["config"].asstr()[()])
+    config = plain_yaml(_text(file["config"][()]))
     if not isinstance(config, dict):
         raise ArtifactError(f"{path}: /config must be a mapping, found {type(config).__name__}")
     parents = tuple(
-        Parent(role, str(node.attrs["path"]), str(node.attrs["sha256"])) for role, node in file["parents"].items()
+        Parent(role, _text(node.attrs["path"]), _text(node.attrs["sha256"])) for role, node in file["parents"].items()
     )
     a = file.attrs
     header = Header(
-        stage=str(a["stage"]),
-        experiment=str(a["experiment"]),
+        stage=_text(a["stage"]),
+        experiment=_text(a["experiment"]),
         config=config,
         seed=int(a["seed"]),
         parents=parents,
         seconds=float(a["seconds"]),
-        device=str(a["device"]),
-        created_utc=str(a["created_utc"]),
-        version=str(a["version"]),
-        packages=json.loads(a["packages"]),
+        device=_text(a["device"]),
+        created_utc=_text(a["created_utc"]),
+        version=_text(a["version"]),
+        packages={key: _text(value) for key, value in plain_mapping(a["packages"], "packages").items()},
     )
     return kind, header
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"a text is needed where {value!r} is")
+    return value

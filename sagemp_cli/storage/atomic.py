@@ -16,6 +16,7 @@ from pathlib import Path
 import h5py
 
 from sagemp_cli.errors import ArtifactError, ResourceError
+from sagemp_cli.reading.regular import is_there
 
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK)
 
@@ -64,7 +65,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     """Raise if ``path`` is in the way: a stage calls this before it starts to work."""
     if path.is_dir():
         raise ArtifactError(f"{path}: is a folder, a file is wanted there")
-    if path.exists() and not overwrite:
+    if is_there(path) and not overwrite:
         raise ArtifactError(f"{path}: exists already; pass --overwrite to replace it")
 
 

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 
 from sagemp_cli.errors import ArtifactError, NonFiniteError
+from sagemp_cli.reading.tree import Dataset, Group
 
 R = TypeVar("R")
 _DIM = re.compile(r"^(?P<name>[A-Za-z_]+)(?P<shift>[+-]\d+)?$")
@@ -132,8 +133,8 @@ def _dataset(node: h5py.Group, name: str, data: np.ndarray, meta: Mapping[str, A
         d.dims[axis].label = dim
 
 
-def read_record(node: h5py.Group, record: type[R], where: str) -> R:
-    """Read a record from an HDF5 group; whatever does not fit the declaration is an :class:`ArtifactError`.
+def read_record(node: Group, record: type[R], where: str) -> R:
+    """Read a record from what an HDF5 group holds; whatever does not fit the declaration is an :class:`ArtifactError`.
 
     Args:
         node: the group.
@@ -166,16 +167,16 @@ def read_record(node: h5py.Group, record: type[R], where: str) -> R:
                 values[name] = data
             case "texts":
                 stored = _dataset_of(node, name, label)
-                if h5py.check_string_dtype(stored.dtype) is None:
+                if stored.dtype.kind != "O":
                     raise ArtifactError(f"{label} must hold text, found type {stored.dtype}")
                 _check_dims(label, meta["dims"], stored.shape, sizes)
-                values[name] = tuple(str(v) for v in stored.asstr()[()])
+                values[name] = tuple(stored[()])
             case "weights":
                 sub = group_of(node, name, label)
                 values[name] = {key: _numeric(sub, key, f"{label}/{key}") for key in sub}
             case "group" if meta["many"]:
                 sub = group_of(node, name, label)
-                count = int(sub.attrs.get("count", len(sub)))
+                count = _scalar(f"{label}/count", "int", sub.attrs.get("count", len(sub)))
                 if count != len(sub):
                     raise ArtifactError(f"{label} should hold {count} groups, found {len(sub)}")
                 values[name] = tuple(
@@ -186,31 +187,22 @@ def read_record(node: h5py.Group, record: type[R], where: str) -> R:
     return record(**values)
 
 
-def _dataset_of(node: h5py.Group, name: str, label: str) -> h5py.Dataset:
-    found = _own(node, name, label)
-    if not isinstance(found, h5py.Dataset):
+def _dataset_of(node: Group, name: str, label: str) -> Dataset:
+    found = node.get(name)
+    if not isinstance(found, Dataset):
         raise ArtifactError(f"{label} must be a dataset")
-    if found.is_virtual or found.external:
-        raise ArtifactError(f"{label} is stored in another file; an artifact must hold all of its data")
     return found
 
 
-def group_of(node: h5py.Group, name: str, label: str) -> h5py.Group:
-    """A member of ``node`` that is a group and lies in this file; ``label`` names it in messages."""
-    found = _own(node, name, label)
-    if not isinstance(found, h5py.Group):
+def group_of(node: Group, name: str, label: str) -> Group:
+    """A member of ``node`` that is a group; ``label`` names it in messages."""
+    found = node.get(name)
+    if not isinstance(found, Group):
         raise ArtifactError(f"{label} must be a group{'' if found is not None else ' and is missing'}")
     return found
 
 
-def _own(node: h5py.Group, name: str, label: str) -> Any:
-    """A member that lies in this file: a link could lead into another file or in a circle."""
-    if name in node and not isinstance(node.get(name, getlink=True), h5py.HardLink):
-        raise ArtifactError(f"{label} is a link; an artifact must hold all of its data itself")
-    return node.get(name)
-
-
-def _numeric(node: h5py.Group, name: str, label: str) -> np.ndarray:
+def _numeric(node: Group, name: str, label: str) -> np.ndarray:
     data = np.asarray(_dataset_of(node, name, label)[()])
     if data.dtype.kind not in "fiub":
         raise ArtifactError(f"{label} must be numeric, found type {data.dtype}")

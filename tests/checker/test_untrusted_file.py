@@ -142,7 +142,7 @@ def lists_of_any_length(file):
     ("change", "message"),
     [
         (many_names, "an object in it has several names"),
-        (nothing_stored, "it unpacks into far more than a certificate of its size holds"),
+        (nothing_stored, "it unpacks into far more than a file of its size holds"),
         (one_text_for_all, "it unpacks into far more|too many texts"),
         (lists_of_any_length, "it holds lists of any length"),
     ],
