@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
-from sagemp_cli.reachability.affine.compiled.foldable_loop import NotFoldable
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.probing import Step, agree, probe, reproduced
-from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions
@@ -30,37 +28,6 @@ PROPAGATORS = {
 
 ROLLOUTS = 12
 """Rollouts that are simulated to compare the step with its recorded program and with the tube."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RecordedLoop:
-    """A stranger's loop as programs; what a propagator gets.
-
-    Attributes:
-        programs: one for all steps, or one per step.
-        horizon: number of steps K.
-        state_dim: number of states n.
-    """
-
-    programs: tuple[Program, ...]
-    horizon: int
-    state_dim: int
-
-    def step(self, k: int, x: Any, w: Any) -> Any:
-        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``, tensors or sets."""
-        return self.programs[k if len(self.programs) > 1 else 0](x, w)
-
-    given_dim: ClassVar[int] = 1
-
-    def given(self, k: int) -> Tensor:
-        """What step k has of its own: nothing, where one program serves all steps."""
-        if len(self.programs) > 1:
-            raise NotFoldable
-        return torch.zeros(0, dtype=torch.float64)
-
-    def step_given(self, given: Any, x: Any, w: Any) -> tuple[Any, None]:
-        """The next state, by the program for all steps."""
-        return self.programs[0](x, w), None
 
 
 def reach(
@@ -202,7 +169,7 @@ def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, vary
     """The loop as programs that do, on all simulated states, what the step does."""
     before = step.all(0, states[:, 0], disturbances[:, 0])
     programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
-    loop = RecordedLoop(programs, steps, states.shape[-1])
+    loop = RecordedLoop(programs, torch.zeros(steps, 0, dtype=torch.float64), steps)
     reproduced(step, states[:, 0], disturbances[:, 0], before)
     for k in range(steps):
         known = torch.isfinite(states[:, k + 1]).all(-1)

@@ -81,6 +81,27 @@ class DynamicsModel:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ProgramRecord:
+    """A step of a closed loop as instructions (see ``docs/program.md``); instruction i makes slot i."""
+
+    kinds: tuple[str, ...] = texts("instructions", "what each instruction does")
+    sizes: np.ndarray = array("instructions", "entries of each result", dtype="int64")
+    operand_begin: np.ndarray = array(
+        "instructions+1", "where each instruction's part of 'operands' begins", dtype="int64"
+    )
+    operands: np.ndarray = array("reads", "slots that are read", dtype="int64")
+    number_begin: np.ndarray = array(
+        "instructions+1", "where each instruction's part of 'numbers' begins", dtype="int64"
+    )
+    numbers: np.ndarray = array("numbers", "constants, exact; limits of a clamp may be infinite", finite=False)
+    index_begin: np.ndarray = array(
+        "instructions+1", "where each instruction's part of 'indices' begins", dtype="int64"
+    )
+    indices: np.ndarray = array("indices", "entries that are picked", dtype="int64")
+    outputs: np.ndarray = array("outputs", "slots of next state, control and deviation (-1: none)", dtype="int64")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Relaxations:
     """The relaxations of a proof, from which it can be done again (see ``docs/certificates.md``)."""
 

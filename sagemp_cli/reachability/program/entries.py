@@ -9,10 +9,17 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError
-from sagemp_cli.reachability.form import unsupported
 from sagemp_cli.reachability.program.conversions import same_type
-from sagemp_cli.reachability.program.program import Recorder
-from sagemp_cli.reachability.program.value import ANSWERS, Traced, answers, ids_of, recorder_of, refuse_traced_index
+from sagemp_cli.reachability.program.recorder import Recorder
+from sagemp_cli.reachability.program.value import (
+    ANSWERS,
+    Traced,
+    answers,
+    ids_of,
+    recorder_of,
+    refuse_traced_index,
+    unsupported,
+)
 
 MOVES = """
     adjoint atleast_1d atleast_2d atleast_3d broadcast_to chunk clone contiguous detach diag diag_embed

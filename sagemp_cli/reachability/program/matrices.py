@@ -11,23 +11,32 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
-from sagemp_cli.reachability.form import unsupported
-from sagemp_cli.reachability.program.arithmetic import add, add_scaled, divide, elementwise, multiply
+from sagemp_cli.reachability.program.arithmetic import (
+    add,
+    add_scaled,
+    divide,
+    elementwise,
+    maximum,
+    minimum,
+    multiply,
+    square,
+)
 from sagemp_cli.reachability.program.conversions import same_type
-from sagemp_cli.reachability.program.value import Traced, answers, exact, is_tensor
+from sagemp_cli.reachability.program.value import Traced, answers, exact, is_tensor, unsupported
 
 _LARGEST_MATRIX = 10_000_000
 """Most entries of the matrix that one linear operation may become."""
 
 
-def _linear(x: Traced, matrix: Tensor, shape: Sequence[int]) -> Traced:
-    """``matrix @ flattened x`` in the given shape."""
+def _linear(x: Traced, matrix: Tensor, shape: Sequence[int], bias: Tensor | None = None) -> Traced:
+    """``matrix @ flattened x + bias`` in the given shape."""
     if matrix.numel() > _LARGEST_MATRIX:
         raise UsageError(
             f"a linear operation of step becomes a matrix of {tuple(matrix.shape)} entries, which is too large"
         )
     operand = x.recorder.operand(x.ids, full=True)
-    return x._like(x.recorder.write(torch.nn.functional.linear, operand, matrix).reshape(tuple(shape)))
+    bias = matrix.new_zeros(len(matrix)) if bias is None else bias
+    return x._like(x.recorder.write("linear", [operand], [matrix, bias]).reshape(tuple(shape)))
 
 
 def _dims(dim: Any, count: int) -> list[int]:
@@ -73,7 +82,7 @@ def norm(
     kind = p if ord is None else ord
     if kind is not None and kind not in (2, "fro"):
         raise unsupported(f"norm(p={kind})")
-    return elementwise(torch.sqrt, total(elementwise(torch.square, x), dim, keepdim))
+    return elementwise("sqrt", total(square(x), dim, keepdim))
 
 
 @answers("linalg_norm")
@@ -97,11 +106,8 @@ def linear(x: Any, weight: Any, bias: Any = None) -> Traced:
     matrix = weight if weight.dim() == 2 else weight[None]
     if rows > 1:
         matrix = torch.kron(torch.eye(rows, dtype=torch.float64), matrix)
-    if bias is None:
-        return _linear(x, matrix, shape)
-    offset = exact(bias, operation="linear bias").expand(shape).reshape(-1)
-    result = x.recorder.write(torch.nn.functional.linear, x.recorder.operand(x.ids, full=True), matrix, offset)
-    return x._like(result.reshape(shape))
+    offset = None if bias is None else exact(bias, operation="linear bias").expand(shape).reshape(-1)
+    return _linear(x, matrix, shape, offset)
 
 
 @answers("matmul", "mm", "mv", "bmm", "__matmul__", "__rmatmul__")
@@ -226,13 +232,13 @@ def _multilinear(function: Callable[..., Tensor], *operands: Any) -> Traced:
 
 
 def _extreme(name: str) -> None:
-    pairwise = getattr(torch, f"{name}imum")
+    pairwise = {"max": maximum, "min": minimum}[name]
 
     def fold(x: Traced, dims: list[int], keepdim: bool) -> Traced:
         shape = torch.zeros(x.shape).sum(dims, keepdim).shape if dims else x.shape
         kept = [d for d in range(x.dim()) if d not in dims]
         columns = x.ids.permute(*kept, *dims).reshape(math.prod(x.shape[d] for d in kept), -1).unbind(-1)
-        folded = functools.reduce(lambda a, b: elementwise(pairwise, a, b), [x._like(c) for c in columns])
+        folded = functools.reduce(pairwise, [x._like(c) for c in columns])
         return folded.reshape(shape)
 
     @answers(name)
@@ -242,7 +248,7 @@ def _extreme(name: str) -> None:
                 f"torch operation '{name}' along a dimension gives indices, which a set does not have; "
                 f"use torch.a{name}"
             )
-        return fold(x, _dims(None, x.dim()), False) if other is None else elementwise(pairwise, x, other)
+        return fold(x, _dims(None, x.dim()), False) if other is None else pairwise(x, other)
 
     @answers(f"a{name}")
     def along(x: Traced, dim: Any = (), keepdim: bool = False) -> Traced:

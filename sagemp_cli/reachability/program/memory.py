@@ -65,7 +65,8 @@ class Example:
         """Call torch. Its errors are the step's."""
         placed = [self._placed(a) for a in args]
         named = {key: self._placed(value) for key, value in kwargs.items()}
-        self.result = function(*placed, **named)
+        with torch.no_grad():  # a weight may be among the constants
+            self.result = function(*placed, **named)
         return self
 
     def _placed(self, value: Any) -> Any:

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.program.loops import check_state, record
 from sagemp_cli.reachability.program.memory import widened
-from sagemp_cli.reachability.program.program import Program, Recorder
-from sagemp_cli.reachability.program.value import UFUNCS, Traced, exact
+from sagemp_cli.reachability.program.program import Program
+from sagemp_cli.reachability.program.value import UFUNCS, Traced
 from sagemp_cli.sets import Box
 
 TOLERANCE = 1e-9
@@ -76,26 +77,16 @@ class Step:
 
     def record(self, k: int, x: Tensor, w: Tensor) -> Program:
         """The program of step k, recorded at one state and disturbance."""
-        recorder = Recorder(x, w)
-        inputs = [
-            Traced(recorder, ids[None].clone() if self.batched else ids.clone()) for ids in (recorder.x, recorder.w)
-        ]
-        shape = inputs[0].shape
         with torch.no_grad():
-            result = self._called(k, *inputs)
-        if recorder.refusal is not None:
-            raise recorder.refusal
-        _check_result(result, shape)
-        if isinstance(result, Traced):
-            if result.recorder is not recorder:
-                raise UsageError("step returned a value of an earlier call; it must be a function of x and w only")
-            ids = result.ids
-        else:
-            ids = recorder.constant(exact(result, operation="return"))
-        return recorder.finish(ids.reshape(-1))
+            return record(lambda x, w: self._stepped(k, x, w), x, w, batched=self.batched)
+
+    def _stepped(self, k: int, x: Any, w: Any) -> Any:
+        result = self._called(k, x, w)
+        check_state(result, x.shape)  # a tuple is no state here
+        return result
 
     def _plain(self, result: Any, shape: torch.Size) -> Tensor:
-        _check_result(result, shape)
+        check_state(result, shape)
         plain = result.detach().as_subclass(Tensor)
         if plain.dtype.is_complex or plain.dtype is torch.bool:
             raise UsageError(f"step returned numbers of type {plain.dtype}, expected real numbers")
@@ -206,15 +197,6 @@ def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, SagempErr
             f"at x = {xs[i].tolist()}, w = {ws[i].tolist()} of the start and disturbance boxes"
         )
     return states, UsageError("it works")
-
-
-def _check_result(result: Any, shape: torch.Size) -> None:
-    if not isinstance(result, (Tensor, Traced)):
-        raise UsageError(
-            f"step returned a {type(result).__name__}, expected the next state as a tensor of shape {tuple(shape)}"
-        )
-    if result.shape != shape:
-        raise UsageError(f"step returned shape {tuple(result.shape)}, expected {tuple(shape)} as that of x")
 
 
 def _line(error: BaseException) -> str:

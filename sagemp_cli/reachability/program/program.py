@@ -1,236 +1,219 @@
-"""A straight-line program of torch operations: what one step of a stranger's loop does, once it has been recorded.
+"""A step of a closed loop as data: a short list of instructions on vectors of real numbers.
 
-Every slot holds a vector; the program runs on anything that answers torch's operations with the vector in the last
-dimension and any batch in front: plain tensors, and every propagator's sets. It needs little of them:
-``v[..., index]``, :func:`torch.cat` along the last dimension, :func:`torch.nn.functional.linear`, sums, products,
-quotients and the functions that have a relaxation.
+``docs/program.md`` is the specification. A program names no code: it is recorded from a loop, run by the propagators,
+carried by a certificate, and evaluated by the checker, each with its own meaning of the same kinds.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import SagempError, UsageError
+from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability.program.kinds import CONSTANTS, INPUTS, KINDS, OF_ONE, OF_TWO, join, pick
 
 
-class Slot(NamedTuple):
-    """The value of an earlier instruction."""
-
-    index: int
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Instruction:
-    """``function(*operands, **options)``, slots among the operands and options standing for their values."""
+    """What makes one vector.
 
-    function: Callable[..., Any]
-    operands: tuple[Any, ...]
-    options: dict[str, Any]
+    Attributes:
+        kind: one of :data:`~sagemp_cli.reachability.program.kinds.KINDS`.
+        size: entries of the result.
+        operands: the slots that are read, all of them earlier ones.
+        constants: float64, taken as exact: see :data:`~sagemp_cli.reachability.program.kinds.CONSTANTS`.
+        entries: of ``pick``, which.
+    """
 
-    def run(self, values: Sequence[Any]) -> Any:
-        """The result, from the values of all earlier slots."""
-        operands = (values[o.index] if isinstance(o, Slot) else o for o in self.operands)
-        options = {k: values[o.index] if isinstance(o, Slot) else o for k, o in self.options.items()}
-        return self.function(*operands, **options)
+    kind: str
+    size: int
+    operands: tuple[int, ...] = ()
+    constants: tuple[Tensor, ...] = ()
+    entries: tuple[int, ...] = ()
+
+    def on(self, *operands: Any) -> Any:
+        """The result on tensors (and whatever answers torch's functions), from the operands' values ``(..., size)``."""
+        if self.kind == "constant":
+            return self.constants[0]
+        if self.kind == "pick":
+            return pick(operands[0], self.entries)
+        if self.kind == "join":
+            return join(operands)
+        if self.kind == "linear":
+            return torch.nn.functional.linear(operands[0], *self.constants)
+        return (OF_ONE.get(self.kind) or OF_TWO[self.kind])(*operands, *self.constants)
+
+
+Evaluate = Callable[[Instruction, Sequence[Any]], Any]
+"""What an instruction makes of its operands' values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """What a step gives: slots of a program, or their values.
+
+    Attributes:
+        next: the next state, n entries.
+        control: the control, if the loop says what it is.
+        deviation: of a learned robot from its model, if it is asked for.
+    """
+
+    next: Any
+    control: Any = None
+    deviation: Any = None
+
+    def of(self, values: Sequence[Any]) -> Outputs:
+        """Values of these slots."""
+        slots = (getattr(self, field.name) for field in fields(self))
+        return Outputs(*(None if slot is None else values[slot] for slot in slots))
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """One step, ``x_{k+1}`` and more from ``x_k``, ``w_k`` and the numbers that step k has of its own.
+
+    Attributes:
+        instructions: instruction i makes slot i; the inputs come first.
+        outputs: slots.
+
+    Raises:
+        UsageError: it is no program; the message says which instruction is wrong and why.
+    """
+
+    instructions: tuple[Instruction, ...]
+    outputs: Outputs
+
+    def __post_init__(self) -> None:
+        for slot, instruction in enumerate(self.instructions):
+            wrong = _complaint(instruction, slot, self.instructions)
+            if wrong:
+                raise UsageError(f"step program: instruction {slot} ('{instruction.kind}') {wrong}")
+        if not self.instructions or self.instructions[0].kind != "state" or "disturbance" not in self.kinds[1:2]:
+            raise UsageError("step program: it must begin with 'state' and 'disturbance'")
+        for name, size in (("next", self.states), ("control", None), ("deviation", self.states)):
+            slot = getattr(self.outputs, name)
+            if slot is None and name != "next":
+                continue
+            if not isinstance(slot, int) or not 0 <= slot < len(self.instructions):
+                raise UsageError(f"step program: output '{name}' must be a slot, found {slot!r}")
+            if size is not None and self.instructions[slot].size != size:
+                raise UsageError(
+                    f"step program: output '{name}' has {self.instructions[slot].size} entries, the state {size}"
+                )
+
+    @functools.cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """Of all instructions."""
+        return tuple(i.kind for i in self.instructions)
+
+    def _size_of(self, kind: str) -> int:
+        return next((i.size for i in self.instructions if i.kind == kind), 0)
 
     @property
-    def sources(self) -> list[int]:
-        """Slots that are read."""
-        return [o.index for o in (*self.operands, *self.options.values()) if isinstance(o, Slot)]
+    def states(self) -> int:
+        """Number of states n."""
+        return self._size_of("state")
 
+    @property
+    def disturbances(self) -> int:
+        """Entries of a disturbance, d."""
+        return self._size_of("disturbance")
 
-@dataclass(frozen=True)
-class Program:
-    """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``; slots 0 and 1 are the inputs.
+    @property
+    def numbers(self) -> int:
+        """Numbers that a step has of its own, g."""
+        return self._size_of("numbers")
 
-    Attributes:
-        instructions: one a slot from slot 2 on; None where nothing needs the slot.
-        result: the slot of the next state, or the next state itself if it does not depend on the inputs.
-    """
+    def run(self, state: Any, disturbance: Any, numbers: Any = None, *, evaluate: Evaluate | None = None) -> Outputs:
+        """What a step gives: of tensors ``(..., n)``, ``(..., d)``, ``(..., g)``, which broadcast; or of sets.
 
-    instructions: tuple[Instruction | None, ...]
-    result: Slot | Tensor
-
-    def __call__(self, x: Any, w: Any) -> Any:
-        """Run on tensors or sets."""
-        if isinstance(self.result, Tensor):
-            return x * 0.0 + self.result
-        values = [x, w]
-        for instruction in self.instructions:
-            values.append(None if instruction is None else instruction.run(values))
-        return values[self.result.index]
-
-
-class Recorder:
-    """Writes a program down while an example is computed.
-
-    Every scalar that the example computes has a number (its id). A tensor of ids says where each of its entries comes
-    from, so that whatever only moves entries is done by torch itself, on ids.
-
-    Attributes:
-        zero: the id of the constant 0, which is 0: operations that fill with zeros fill with it.
-        unwritten: the id of an entry that has no value yet.
-        refusal: the first error that said that the step cannot be bounded, should the step have caught it.
-    """
-
-    zero = 0
-    unwritten = -1
-
-    def __init__(self, x: Tensor, w: Tensor) -> None:
-        self.refusal: SagempError | None = None
-        self._instructions: list[Instruction | None] = []
-        self._starts: list[int] = []
-        self._constant: list[bool] = []
-        self._examples: list[Tensor] = []
-        self._table = torch.zeros(1, dtype=torch.float64)
-        self._slots: dict[Any, int] = {}
-        self._new(None, torch.zeros(1, dtype=torch.float64), constant=True)
-        self.x = self._new(None, x.reshape(-1)).reshape(x.shape)
-        self.w = self._new(None, w.reshape(-1)).reshape(w.shape)
-
-    # -- ids -----------------------------------------------------------------------------------------------------------
-
-    def constant(self, value: Tensor) -> Tensor:
-        """Ids of constants, in the shape of ``value`` (float64)."""
-        return self._new(None, value.detach().reshape(-1).clone(), constant=True).reshape(value.shape)
-
-    def is_constant(self, ids: Tensor) -> bool:
-        """Whether no entry depends on the inputs."""
-        return bool(self.constant_entries(ids).all())
-
-    def constant_entries(self, ids: Tensor) -> Tensor:
-        """Which entries do not depend on the inputs."""
-        self._check_written(ids)
-        return torch.tensor(self._constant)[self._owners(ids)]
-
-    def example(self, ids: Tensor) -> Tensor:
-        """The numbers of the example, in the shape and strides of the ids; NaN where nothing was written."""
-        return torch.where(ids < 0, torch.nan, self._table[ids.clamp(min=0)])
-
-    # -- writing -------------------------------------------------------------------------------------------------------
-
-    def operand(self, ids: Tensor, *, full: bool = False) -> Slot | Tensor:
-        """What an instruction reads for these ids: a slot, or a tensor if all are constants.
-
-        The vector has one entry per id, or a single one if all are equal and ``full`` is not asked for.
+        Args:
+            state, disturbance, numbers: values of the inputs.
+            evaluate: what the other instructions do, on values of one's own; on tensors by default.
         """
-        flat = ids.reshape(-1).contiguous()
-        if self.is_constant(flat):
-            return self._table[flat]
-        unique, inverse = torch.unique(flat, return_inverse=True)
-        slot = self._gathered(unique)
-        if len(unique) == 1 and not full or torch.equal(inverse, torch.arange(len(unique))):
-            return Slot(slot)
-        return Slot(self._write_once(_pick, (Slot(slot), _selection(inverse))))
+        given = {"state": state, "disturbance": disturbance, "numbers": numbers}
+        values: list[Any] = []
+        for instruction in self.instructions:
+            if instruction.kind in INPUTS:
+                values.append(given[instruction.kind])
+                continue
+            operands = [values[slot] for slot in instruction.operands]
+            values.append(instruction.on(*operands) if evaluate is None else evaluate(instruction, operands))
+        outputs = self.outputs.of(values)
+        after = outputs.next
+        if evaluate is None and isinstance(after, Tensor) and after.dim() < len(state.shape):  # a constant has no batch
+            after = after.expand(state.shape) if isinstance(state, Tensor) else state * 0.0 + after
+            return replace(outputs, next=after)
+        return outputs
 
-    def write(self, function: Callable[..., Any], *operands: Any, **options: Any) -> Tensor:
-        """Append an instruction; ids ``(m,)`` of its result. Without a slot among the operands it gives constants."""
-        instruction = Instruction(function, operands, options)
-        value = instruction.run(self._examples)
-        if not instruction.sources:
-            return self.constant(value.to(torch.float64))
-        return self._new(instruction, value)
+    def same_as(self, other: Program) -> bool:
+        """Whether both are the same, number by number."""
 
-    def finish(self, result: Tensor) -> Program:
-        """The program whose result has these ids ``(n,)``; what the result does not need is dropped."""
-        last = self.operand(result, full=True)
-        if isinstance(last, Tensor):
-            return Program((), last)
-        # The program has the inputs first; constants are inside the instructions.
-        order = [i for i in range(len(self._instructions)) if self._instructions[i] is not None]
-        number = {1: 0, 2: 1} | {slot: 2 + i for i, slot in enumerate(order)}
-        needed, pending = set(), [last.index]
-        while pending:
-            slot = pending.pop()
-            if slot not in needed:
-                needed.add(slot)
-                instruction = self._instructions[slot]
-                pending.extend([] if instruction is None else instruction.sources)
+        def key(i: Instruction) -> Any:
+            return i.kind, i.size, i.operands, i.entries, len(i.constants)
 
-        def moved(o: Any) -> Any:
-            return Slot(number[o.index]) if isinstance(o, Slot) else o
-
-        def renumbered(slot: int) -> Instruction | None:
-            old = self._instructions[slot]
-            if old is None or slot not in needed:
-                return None
-            return Instruction(
-                old.function, tuple(moved(o) for o in old.operands), {k: moved(o) for k, o in old.options.items()}
+        return (
+            len(self.instructions) == len(other.instructions)
+            and vars(self.outputs) == vars(other.outputs)
+            and all(
+                key(a) == key(b) and all(map(torch.equal, a.constants, b.constants))
+                for a, b in zip(self.instructions, other.instructions, strict=True)
             )
-
-        return Program(tuple(renumbered(slot) for slot in order), Slot(number[last.index]))
-
-    # -- bookkeeping ---------------------------------------------------------------------------------------------------
-
-    def _new(self, instruction: Instruction | None, value: Tensor, *, constant: bool = False) -> Tensor:
-        start = self._starts[-1] + len(self._examples[-1]) if self._starts else 0
-        self._instructions.append(instruction)
-        self._starts.append(start)
-        self._constant.append(constant)
-        self._examples.append(value)
-        stop = start + len(value)
-        if stop > len(self._table):
-            self._table = torch.cat([self._table, self._table.new_zeros(max(stop - len(self._table), 1024))])
-        self._table[start:stop] = value
-        return torch.arange(start, stop)
-
-    def _owners(self, ids: Tensor) -> Tensor:
-        return torch.bucketize(ids.contiguous(), torch.tensor(self._starts), right=True) - 1
-
-    def _check_written(self, ids: Tensor) -> None:
-        if ids.numel() and int(ids.min()) < 0:
-            raise UsageError(
-                "step reads an entry that was never written (torch.empty_like leaves entries without a value)"
-            )
-
-    def _gathered(self, unique: Tensor) -> int:
-        """A slot whose entries are these ids, which are sorted."""
-        owners = self._owners(unique)
-        parts: list[Any] = []
-        for owner in torch.unique(owners).tolist():
-            mine = unique[owners == owner] - self._starts[owner]
-            if self._constant[owner]:
-                parts.append(self._examples[owner][mine])
-            elif len(mine) == len(self._examples[owner]):
-                parts.append(Slot(owner))
-            else:
-                parts.append(Slot(self._write_once(_pick, (Slot(owner), _selection(mine)))))
-        return parts[0].index if len(parts) == 1 else self._write_once(_join, tuple(parts))
-
-    def _write_once(self, function: Callable[..., Any], operands: tuple[Any, ...]) -> int:
-        key = (function, *(tuple(o.tolist()) if isinstance(o, Tensor) else o for o in operands))
-        if key not in self._slots:
-            instruction = Instruction(function, operands, {})
-            self._new(instruction, instruction.run(self._examples))
-            self._slots[key] = len(self._instructions) - 1
-        return self._slots[key]
+        )
 
 
-class Run(NamedTuple):
-    """Neighbouring entries of a vector."""
+def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str | None:
+    """What is wrong with an instruction."""
+    if i.kind not in KINDS:
+        return f"is none of {', '.join(KINDS)}"
+    if i.kind in INPUTS and slot != INPUTS.index(i.kind):
+        return "must be among the first, in the order state, disturbance, numbers"
+    if any(not 0 <= o < slot for o in i.operands):
+        return f"reads slots {list(i.operands)}, allowed are earlier ones"
+    sizes = [before[o].size for o in i.operands]
+    count = {"pick": 1, "linear": 1, "join": max(len(sizes), 1)}.get(
+        i.kind, (i.kind in OF_ONE) + 2 * (i.kind in OF_TWO)
+    )
+    if len(sizes) != count:
+        return f"reads {len(sizes)} slots, expected {count}"
+    if i.size < 0 or (i.size == 0 and i.kind != "numbers"):
+        return f"has {i.size} entries"
+    made = {
+        "pick": len(i.entries),
+        "join": sum(sizes),
+        "linear": i.size,
+    }.get(i.kind, max(sizes, default=i.size))
+    if i.size != made or (i.kind in OF_TWO and not set(sizes) <= {1, made}):
+        return f"makes {i.size} entries of {sizes}"
+    if any(not 0 <= e < sizes[0] for e in i.entries) or (i.entries and i.kind != "pick"):
+        return "picks entries that are not there"
+    return _complaint_of_constants(i, sizes)
 
-    first: int
-    stop: int
 
-
-def _selection(index: Tensor) -> Run | Tensor:
-    """The same entries, as a run where they are one."""
-    first, stop = int(index[0]), int(index[0]) + len(index)
-    return Run(first, stop) if torch.equal(index, torch.arange(first, stop)) else index
-
-
-def _pick(value: Any, entries: Run | Tensor) -> Any:
-    if isinstance(entries, Run):
-        return value[..., entries.first : entries.stop]
-    return value.index_select(-1, entries) if isinstance(value, Tensor) else value[..., entries]
-
-
-def _join(*parts: Any) -> Any:
-    """Vectors one after the other; constants are repeated for the batch of the others."""
-    batch = max((p.shape[:-1] for p in parts), key=len)
-    return torch.cat([p if len(p.shape) > len(batch) else p.expand(*batch, p.shape[-1]) for p in parts], dim=-1)
+def _complaint_of_constants(i: Instruction, sizes: Sequence[int]) -> str | None:
+    names = CONSTANTS.get(i.kind, ())
+    if len(i.constants) != len(names):
+        return f"has {len(i.constants)} constants, expected {len(names)}"
+    for name, value in zip(names, i.constants, strict=True):
+        shape = {"matrix": (i.size, *sizes)}.get(
+            name, (i.size,) if name in ("bias", "the vector", "lower", "upper") else ()
+        )
+        if value.shape != shape or value.dtype != torch.float64:
+            return f"has {name} {tuple(value.shape)} {value.dtype}, expected {tuple(shape)} torch.float64"
+        if bool(torch.isnan(value).any()) or (i.kind != "clamp" and not bool(torch.isfinite(value).all())):
+            return f"has a {name} that is not finite"
+    numbers = [float(c) for c in i.constants if not c.dim()]
+    if i.kind == "leaky_relu" and numbers[0] > 1:
+        return f"has slope {numbers[0]}, allowed is at most 1"
+    if i.kind == "elu" and numbers[0] != 1:
+        return f"has alpha {numbers[0]}, allowed is 1"
+    if i.kind == "softplus" and not numbers[0] > 0:
+        return f"has beta {numbers[0]}, allowed is a positive one"
+    if i.kind == "pow" and (numbers[0] != int(numbers[0]) or abs(numbers[0]) >= 2**31 or numbers[0] in (0, 1)):
+        return f"has exponent {numbers[0]}, allowed are whole numbers other than 0 and 1"
+    return None

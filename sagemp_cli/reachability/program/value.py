@@ -1,6 +1,6 @@
 """Values that stand in for tensors while a stranger's step is recorded, and mean exactly what torch's tensors mean.
 
-A :class:`Traced` value is a tensor of ids (:class:`~sagemp_cli.reachability.program.program.Recorder`). Whatever only
+A :class:`Traced` value is a tensor of ids (:class:`~sagemp_cli.reachability.program.recorder.Recorder`). Whatever only
 moves entries (indexing, reshaping, stacking, views, assignment in place) is done by torch itself on the ids, so that
 shapes, views and aliases are torch's own. Arithmetic and the functions that have a relaxation are written into the
 program. All else is an error that names the operation; above all, nothing may ask for the number that a value has: a
@@ -24,7 +24,7 @@ from torch import Tensor
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.form import unsupported
 from sagemp_cli.reachability.program.memory import Example
-from sagemp_cli.reachability.program.program import Recorder
+from sagemp_cli.reachability.program.recorder import Recorder
 
 _CLAMPS = ("clamp", "clip", "clamp_min", "clamp_max", "maximum", "minimum", "fmax", "fmin", "max", "min", "hardtanh")
 """Functions whose limits may be infinite."""
@@ -48,7 +48,9 @@ def exact(value: Any, *, operation: str) -> Tensor:
         value = torch.tensor(value)
     elif isinstance(value, int) and int(float(value)) != value:
         raise UnsupportedOperationError(f"constant {value} of '{operation}' cannot be held in float64")
-    tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().cpu()
+    tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).cpu()
+    if not torch.is_grad_enabled():  # where it is, a tube is differentiated by the constants, the weights among them
+        tensor = tensor.detach()
     if tensor.layout is not torch.strided or tensor.dtype.is_complex or tensor.is_quantized:
         raise UnsupportedOperationError(
             f"constant of '{operation}' is {tensor.dtype} {tensor.layout}, allowed are dense real tensors"

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from sagemp_cli.errors import SagempError
-from sagemp_cli.reachability.program.program import Recorder
+from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.value import Traced
 
 NAMESPACES = (
@@ -78,8 +78,8 @@ def argument_lists(like: torch.Tensor) -> list[tuple[Any, ...]]:
     """Values, lists of values, constants and numbers in the first positions."""
 
     def value() -> Traced:
-        recorder = Recorder(like, like)
-        return Traced(recorder, recorder.x)
+        recorder = Recorder(like.flatten(), like.flatten(), like.flatten()[:0])
+        return Traced(recorder, recorder.state.reshape(like.shape))
 
     def one(kind: str, shared: Traced) -> Any:
         return {

@@ -12,7 +12,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from sagemp_cli.errors import SagempError
 from sagemp_cli.reachability import reach
-from sagemp_cli.reachability.program.program import Recorder
+from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.value import Traced
 from sagemp_cli.sets import Box
 
@@ -177,9 +177,9 @@ def layouts(draw):
 
 def plain_and_recorded(shape, lay):
     numbers = torch.randn(shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
-    recorder = Recorder(numbers.flatten(), torch.zeros(1, dtype=torch.float64))
+    recorder = Recorder(numbers.flatten(), torch.zeros(1, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
     plain = numbers.clone()
-    recorded = Traced(recorder, recorder.x.reshape(shape))
+    recorded = Traced(recorder, recorder.state.reshape(shape))
     return recorder, (plain, lay(plain)), (recorded, lay(recorded))
 
 

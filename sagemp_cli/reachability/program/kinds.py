@@ -1,0 +1,81 @@
+"""The kinds of instructions of a step program, and what each does to tensors (``docs/program.md`` specifies them).
+
+A vector is the last dimension of a tensor; any batch is in front.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+INPUTS = ("state", "disturbance", "numbers")
+"""What a step is given, in the order in which a program begins."""
+
+Function = Callable[..., Any]
+
+OF_ONE: Mapping[str, Function] = {
+    "neg": torch.neg,
+    "sin": torch.sin,
+    "cos": torch.cos,
+    "tan": torch.tan,
+    "atan": torch.atan,
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "silu": nn.functional.silu,
+    "exp": torch.exp,
+    "log": torch.log,
+    "sqrt": torch.sqrt,
+    "abs": torch.abs,
+    "reciprocal": torch.reciprocal,
+    "relu": torch.relu,
+    "leaky_relu": lambda a, slope: nn.functional.leaky_relu(a, float(slope)),
+    "elu": lambda a, alpha: nn.functional.elu(a, float(alpha)),
+    "softplus": lambda a, beta, threshold: nn.functional.softplus(a, float(beta), float(threshold)),
+    "pow": lambda a, exponent: torch.pow(a, int(exponent)),
+    "clamp": torch.clamp,
+    "identity": lambda a: a,
+}
+"""Functions of one vector, entry by entry, with their constants."""
+
+OF_TWO: Mapping[str, Function] = {
+    "add": torch.add,
+    "sub": torch.sub,
+    "mul": torch.mul,
+    "div": torch.div,
+    "maximum": torch.maximum,
+    "minimum": torch.minimum,
+    "atan2": torch.atan2,
+}
+"""Functions of two vectors, entry by entry; a vector of one entry goes with every entry of the other."""
+
+CONSTANTS: Mapping[str, tuple[str, ...]] = {
+    "constant": ("the vector",),
+    "linear": ("matrix", "bias"),
+    "leaky_relu": ("slope",),
+    "elu": ("alpha",),
+    "softplus": ("beta", "threshold"),
+    "pow": ("exponent",),
+    "clamp": ("lower", "upper"),
+}
+"""The constants of the kinds that have any: vectors as long as the result, the matrix ``(r, c)``, else one number."""
+
+KINDS = (*INPUTS, "constant", "pick", "join", "linear", *OF_TWO, *OF_ONE)
+"""All of them."""
+
+
+def pick(value: Any, entries: Sequence[int]) -> Any:
+    """Entries of a vector; neighbours as a slice, which costs nothing."""
+    first, stop = entries[0], entries[0] + len(entries)
+    if tuple(entries) == tuple(range(first, stop)):
+        return value[..., first:stop]
+    index = torch.tensor(entries)
+    return value.index_select(-1, index) if isinstance(value, Tensor) else value[..., index]
+
+
+def join(parts: Sequence[Any]) -> Any:
+    """Vectors one after the other; those without a batch are repeated for the batch of the others."""
+    batch = max((p.shape[:-1] for p in parts), key=len)
+    return torch.cat([p if len(p.shape) > len(batch) else p.expand(*batch, p.shape[-1]) for p in parts], dim=-1)

@@ -1,0 +1,148 @@
+"""Closed loops as programs: what every propagator gets, whatever the loop was written as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability.program.program import Outputs, Program
+from sagemp_cli.reachability.program.recorder import Recorder
+from sagemp_cli.reachability.program.value import Traced, exact
+from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.sets import Box
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLoop:
+    """A closed loop as data.
+
+    Attributes:
+        programs: one for all steps, or one per step.
+        numbers: what each step has of its own, ``(K, ..., g)``; dimensions between are a batch of loops.
+        horizon: number of steps K.
+    """
+
+    programs: tuple[Program, ...]
+    numbers: Tensor
+    horizon: int
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states n."""
+        return self.programs[0].states
+
+    @property
+    def batch(self) -> torch.Size:
+        """Shape of the batch of loops that this is."""
+        return self.numbers.shape[1:-1]
+
+    def program(self, k: int) -> Program:
+        """Of step k."""
+        return self.programs[k if len(self.programs) > 1 else 0]
+
+    def outputs(self, k: int, x: Any, w: Any) -> Outputs:
+        """What step k gives, from ``x_k (..., n)`` and ``w_k (..., d)``."""
+        return self.program(k).run(x, w, self.numbers[k])
+
+    def step(self, k: int, x: Any, w: Any) -> Any:
+        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``."""
+        return self.outputs(k, x, w).next
+
+
+def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
+    """The loop as programs; one that is recorded already as it is.
+
+    A loop that says what its steps have of their own (``given``, ``step_given``) is one program, with that as the
+    step's numbers. Of any other every step is recorded by itself; steps that turn out to be the same are one program.
+
+    Args:
+        loop: steps in torch operations; see :class:`~sagemp_cli.reachability.propagator.Loop`.
+        start, disturbance: boxes ``(..., n)`` and ``(d,)``; an example is computed at a centre of theirs.
+
+    Raises:
+        UnsupportedOperationError: an operation that cannot be bounded.
+        UsageError: a step that returns something else than the next state.
+    """
+    if isinstance(loop, RecordedLoop):
+        return loop
+    steps = loop.horizon
+    x, w = start.center.reshape(-1, start.dim)[0], disturbance.center.reshape(-1, disturbance.dim)[0]
+    if _says_its_steps(loop):
+        given = torch.stack([loop.given(k) for k in range(steps)]).to(torch.float64)
+        shape = given.shape[given.dim() - loop.given_dim :]
+        numbers = given.reshape(*given.shape[: given.dim() - loop.given_dim], -1)
+        program = record(lambda x, w, p: loop.step_given(p.reshape(shape), x, w), x, w, numbers.flatten(0, -2)[0])
+        return RecordedLoop((program,), numbers, steps)
+    programs = [record(lambda x, w, k=k: loop.step(k, x, w), x, w) for k in range(steps)]
+    if all(programs[0].same_as(other) for other in programs[1:]):
+        programs = programs[:1]
+    return RecordedLoop(tuple(programs), torch.zeros(steps, 0, dtype=torch.float64), steps)
+
+
+def _says_its_steps(loop: Any) -> bool:
+    """Whether a loop's ``step_given`` says what its ``step`` does: whether none of its classes came later with another
+    ``step`` or ``control``.
+    """
+    kinds = type(loop).__mro__
+    last = next((i for i, kind in enumerate(kinds) if "step_given" in vars(kind)), None)
+    if last is None or any(name in getattr(loop, "__dict__", {}) for name in ("step", "control")):
+        return False
+    return not any(name in vars(kind) for kind in kinds[:last] for name in ("step", "control"))
+
+
+def record(
+    call: Callable[..., Any],
+    state: Tensor,
+    disturbance: Tensor,
+    numbers: Tensor | None = None,
+    *,
+    batched: bool = False,
+) -> Program:
+    """The program of one call.
+
+    Args:
+        call: of values that stand for ``x (n,)``, ``w (d,)`` and, if there are any, the numbers ``(g,)``; it returns
+            the next state, or next state, control and deviation, the last two or one of which may be missing or None.
+        state, disturbance, numbers: an example, ``(n,)``, ``(d,)``, ``(g,)``.
+        batched: whether the call takes batches, and gets batches of one.
+    """
+    recorder = Recorder(state, disturbance, torch.zeros(0, dtype=torch.float64) if numbers is None else numbers)
+    ids = [recorder.state, recorder.disturbance, *([] if numbers is None else [recorder.numbers])]
+    inputs = [Traced(recorder, i[None].clone() if batched else i.clone()) for i in ids]
+    result = call(*inputs)
+    if recorder.refusal is not None:
+        raise recorder.refusal
+    parts = dict(
+        zip(("next", "control", "deviation"), result if isinstance(result, tuple) else (result,), strict=False)
+    )
+    check_state(parts["next"], inputs[0].shape)
+    return recorder.finish(**{name: _ids(recorder, part) for name, part in parts.items()})
+
+
+def _ids(recorder: Recorder, value: Any) -> Tensor | None:
+    if value is None:
+        return None
+    if not isinstance(value, Traced):
+        return recorder.constant(exact(value, operation="return")).reshape(-1)
+    if value.recorder is not recorder:
+        raise UsageError("step returned a value of an earlier call; it must be a function of x and w only")
+    return value.ids.reshape(-1)
+
+
+def check_state(result: Any, shape: Sequence[int]) -> None:
+    """Refuse what is not the next state.
+
+    Raises:
+        UsageError: it is no tensor, or of another shape than the state.
+    """
+    if not isinstance(result, (Tensor, Traced)):
+        raise UsageError(
+            f"step returned a {type(result).__name__}, expected the next state as a tensor of shape {tuple(shape)}"
+        )
+    if result.shape != shape:
+        raise UsageError(f"step returned shape {tuple(result.shape)}, expected {tuple(shape)} as that of x")
