@@ -11,8 +11,15 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UsageError, did_you_mean
+from sagemp_cli.reachability.program.comparing import (
+    MOST_POINTS,
+    climbed,
+    compare,
+    corners_and_centres,
+    near_kinks,
+)
 from sagemp_cli.reachability.program.loops import RecordedLoop
-from sagemp_cli.reachability.program.probing import Step, agree, probe, reproduced
+from sagemp_cli.reachability.program.probing import GlobalRandomness, Step, probe, reproduced, steady
 from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions
@@ -50,7 +57,10 @@ def reach(
     as torch computes it. A simulated rollout differs by its own rounding (most in float32), which is not enclosed.
 
     Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness).
-    A step whose calls differ, or that leaves the recorded program on a simulated rollout, is refused.
+    A step whose calls differ (a few dozen at random states, then up to 200 at one), that draws from the random
+    generators shared by all, or that differs from the recorded program by more than rounding on simulated rollouts, at
+    corners and centres of cells and of the tube's boxes, or near the program's thresholds, is refused. A change that
+    shows only after more calls, or depends on a clock, is not noticed.
 
     Args:
         step: ``step(x, w)`` on a state ``(n,)`` and a disturbance ``(d,)`` or on batches ``(B, n)``, ``(B, d)``; it
@@ -84,13 +94,18 @@ def reach(
         raise UsageError(f"partitions must be 1 for a start box that is a point, found {partitions!r}")
     cells = partition(start, counts) if uncertain else Box(start.lower[None], start.upper[None])
 
+    drawn = GlobalRandomness()
     called = probe(function, start, disturbance, batched=batched)
     states, disturbances = _simulated(called, start, disturbance, steps)
     loop = _recorded(called, states, disturbances, steps, varying)
+    _compare_at_the_start(called, loop, cells, start, disturbance)
     chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
     with torch.no_grad():
         tubes = [chosen.propagate(loop, Box(low, high), disturbance) for low, high in chunks]
     tube = Tube(torch.cat([t.lower for t in tubes]), torch.cat([t.upper for t in tubes])).hull()
+    _compare_on_the_tube(called, loop, tube, disturbance)
+    steady(called, states[0, 0], disturbances[0, 0])
+    drawn.refuse()
     _check_inside(tube, states)
     return tube
 
@@ -169,18 +184,37 @@ def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, vary
     """The loop as programs that do, on all simulated states, what the step does."""
     before = step.all(0, states[:, 0], disturbances[:, 0])
     programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
-    loop = RecordedLoop(programs, torch.zeros(steps, 0, dtype=torch.float64), steps)
     reproduced(step, states[:, 0], disturbances[:, 0], before)
-    for k in range(steps):
-        known = torch.isfinite(states[:, k + 1]).all(-1)
-        if bool(known.any()) and not agree(
-            loop.step(k, states[known, k], disturbances[known, k]), states[known, k + 1]
-        ):
-            raise UsageError(
-                f"step does not always do the same: at step {k} of a simulated rollout it differs from what it did "
-                f"when it was recorded; it must be a function of x and w only, in torch operations"
-            )
-    return loop
+    # One comparison for all steps that one program serves.
+    at = [slice(k, k + 1) for k in range(steps)] if varying else [slice(0, steps)]
+    for k, (program, part) in enumerate(zip(programs, at, strict=True)):
+        after = states[:, 1:][:, part].flatten(0, 1)
+        compare(step, k, program, states[:, part].flatten(0, 1), disturbances[:, part].flatten(0, 1), after)
+    return RecordedLoop(programs, torch.zeros(steps, 0, dtype=torch.float64), steps)
+
+
+def _compare_at_the_start(step: Step, loop: RecordedLoop, cells: Box, start: Box, disturbance: Box) -> None:
+    """Compare step and program where they may differ: cells' corners and centres, thresholds, along the gradient."""
+    program = loop.programs[0]
+    compare(step, 0, program, *corners_and_centres(cells, disturbance, most=MOST_POINTS[step.rowwise]))
+    compare(step, 0, program, *near_kinks(program, start, disturbance))
+    points = climbed(step, program, start, disturbance)
+    if points is not None:
+        compare(step, 0, program, *points)
+
+
+def _compare_on_the_tube(step: Step, loop: RecordedLoop, tube: Tube, disturbance: Box) -> None:
+    """Compare step and program at the centres and at corners of the tube's boxes."""
+    most = MOST_POINTS[step.rowwise]
+    bounded = torch.isfinite(tube.lower).all(-1) & torch.isfinite(tube.upper).all(-1)
+    if len(loop.programs) == 1:
+        boxes = Box(tube.lower[:-1][bounded[:-1]], tube.upper[:-1][bounded[:-1]])
+        compare(step, 0, loop.programs[0], *corners_and_centres(boxes, disturbance, most=most))
+        return
+    for k, program in enumerate(loop.programs):
+        if bool(bounded[k]):
+            box = Box(tube.lower[k : k + 1], tube.upper[k : k + 1])
+            compare(step, k, program, *corners_and_centres(box, disturbance, most=max(2, most // loop.horizon)))
 
 
 def _check_inside(tube: Tube, states: Tensor) -> None:

@@ -6,6 +6,8 @@ call (:mod:`sagemp_cli.reachability.program.value`); the calls made here test th
 
 from __future__ import annotations
 
+import random
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -67,6 +69,14 @@ class Step:
             xs, ws = (v.detach().clone().as_subclass(_Exact) for v in (xs, ws))
             return self._plain(self._called(k, xs, ws), xs.shape)
         return torch.stack([self.at(k, x, w) for x, w in zip(xs, ws, strict=True)])
+
+    def differentiable(self, k: int, xs: Tensor, ws: Tensor) -> Tensor:
+        """The next states ``(B, n)``, for autograd."""
+        xs, ws = (v.as_subclass(_Exact) for v in (xs, ws))
+        if self.rowwise:
+            return self._called(k, xs * 1.0, ws * 1.0).as_subclass(Tensor)
+        rows = [(x[None], w[None]) if self.batched else (x, w) for x, w in zip(xs * 1.0, ws * 1.0, strict=True)]
+        return torch.stack([self._called(k, x, w).as_subclass(Tensor).reshape(-1) for x, w in rows])
 
     def at(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """The next state ``(n,)`` from a state ``(n,)`` and a disturbance ``(d,)`` in plain float64."""
@@ -156,6 +166,45 @@ def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
                 f"step gives another result when it is called again with the same x and w (difference "
                 f"{float((after - before).abs().max()):.3g}); it must be a function of x and w only: no randomness "
                 f"(dropout: call .eval()), no counters, no state kept between calls"
+            )
+
+
+REPEATED, SECONDS = 200, 0.05
+"""Calls at one state at the end, and the time after which there are no more."""
+
+
+def steady(step: Step, x: Tensor, w: Tensor) -> None:
+    """Refuse a step whose result at one state changes within :data:`REPEATED` further calls."""
+    began = time.perf_counter()
+    with torch.no_grad():
+        first = step.at(0, x, w)
+        for _ in range(REPEATED):
+            if not torch.equal(step.at(0, x, w), first):
+                raise UsageError(
+                    "step gives another result when it is called again with the same x and w; it must be a function "
+                    "of x and w only: no randomness, no counters, no state kept between calls"
+                )
+            if time.perf_counter() - began > SECONDS:
+                break
+
+
+class GlobalRandomness:
+    """Whether random numbers were drawn, used or not, from the generators that torch, Python and numpy share."""
+
+    def __init__(self) -> None:
+        self._before = self._states()
+
+    @staticmethod
+    def _states() -> tuple[Any, ...]:
+        shared = np.random.get_state(legacy=False)["state"]  # noqa: NPY002  (the one that a step may draw from)
+        return torch.get_rng_state().numpy().tobytes(), random.getstate(), shared["key"].tobytes(), shared["pos"]
+
+    def refuse(self) -> None:
+        """Refuse the step if any were drawn since."""
+        if self._states() != self._before:
+            raise UsageError(
+                "step draws random numbers; it must be a function of x and w only (dropout: call .eval(); constants "
+                "of a seed: draw them once, outside)"
             )
 
 

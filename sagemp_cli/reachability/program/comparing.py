@@ -1,0 +1,175 @@
+"""Whether a recorded program does what the step does, to the last roundings, where a difference would show.
+
+The program is evaluated in interval arithmetic at points, which encloses its exact value there; what the step computes
+may lie outside by some widths of that interval, which is the size of what rounding does to it. Compared are chosen
+points, not all: what is proved is proved of the program.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.program.probing import TOLERANCE, Step
+from sagemp_cli.reachability.program.program import Program
+from sagemp_cli.sets import Box
+
+ROUNDINGS = 16
+"""Widths of the interval of a point that the step's own result may lie outside."""
+
+MOST_POINTS = {True: 4096, False: 256}
+"""Points at most in one comparison: of steps that take batches, of steps that take single states."""
+
+_KINKS, _STARTS, _NEWTON = 32, 4, 4
+_AROUND = (0.0, 1e-3, -1e-3, 0.1, -0.1, 1.0, -1.0)
+
+
+def compare(step: Step, k: int, program: Program, x: Tensor, w: Tensor, after: Tensor | None = None) -> None:
+    """Refuse a step that differs from its program at states ``(B, n)`` and disturbances ``(B, d)``.
+
+    Where there are more points than :data:`MOST_POINTS`, every so many is taken. Points where the step gives no finite
+    result are left out; where the interval is infinite, a relative tolerance of 1e-9 stands in.
+
+    Args:
+        after: the next states, if they are known.
+    """
+    if not len(x):
+        return
+    if after is None:
+        every = max(1, -(-len(x) // MOST_POINTS[step.rowwise]))
+        x, w = x[::every], w[::every]
+        with torch.no_grad():
+            after = step.all(k, x, w)
+    known = torch.isfinite(after).all(-1)
+    x, w, after = x[known], w[known], after[known]
+    if not len(x):
+        return
+    with torch.no_grad():
+        low, high = program.run(IntervalForm(x, x), IntervalForm(w, w)).next.bounds()
+        slack = ROUNDINGS * ((high - low) + 2.0**-52 * after.abs())
+        off = (after < low - slack) | (after > high + slack)
+        loose = ~torch.isfinite(slack)
+        if bool(loose.any()):
+            plain = program.run(x, w).next.expand(after.shape)
+            off = torch.where(loose, ~((after - plain).abs() <= TOLERANCE * (1.0 + after.abs())), off)
+    if bool(off.any()):
+        row, i = torch.nonzero(off)[0].tolist()
+        raise UsageError(
+            f"step does not always do the same: at step {k} it differs from what it did when it was recorded (x = "
+            f"{x[row].tolist()}, w = {w[row].tolist()}: state {i} becomes {after[row, i].item():.17g}, recorded "
+            f"{(low[row, i] + high[row, i]).item() / 2:.17g}); it must be a function of x and w only, in torch "
+            f"operations"
+        )
+
+
+def corners_and_centres(cells: Box, disturbance: Box, *, most: int) -> tuple[Tensor, Tensor]:
+    """Points ``(B, n)``, ``(B, d)``: the centre and corners of each cell ``(C, n)``, together with the disturbances'.
+
+    Corners of many dimensions, and cells beyond ``most`` points, are drawn at random with a fixed seed.
+    """
+    generator = torch.Generator().manual_seed(2)
+    both = Box(
+        torch.cat([cells.lower, disturbance.lower.expand(len(cells.lower), -1)], -1),
+        torch.cat([cells.upper, disturbance.upper.expand(len(cells.lower), -1)], -1),
+    )
+    dims = both.dim
+    if dims <= 6:
+        upper = torch.tensor(list(itertools.product([False, True], repeat=dims)))
+    else:
+        upper = torch.rand(64, dims, generator=generator) < 0.5
+        upper[0], upper[1] = False, True
+    kept = max(1, most // (len(upper) + 1))
+    if len(both.lower) > kept:
+        chosen = torch.randperm(len(both.lower), generator=generator)[:kept]
+        both = Box(both.lower[chosen], both.upper[chosen])
+    corners = torch.where(upper, both.upper[:, None], both.lower[:, None]).flatten(0, 1)
+    return torch.cat([both.center, corners]).split([cells.dim, disturbance.dim], dim=-1)
+
+
+class _Kinks(TorchFunctionMode):
+    """Notes how far values are from where the functions that have kinks have them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gaps: list[Tensor] = []
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = function(*args, **(kwargs or {}))
+        for gap in _gaps(getattr(function, "__name__", ""), *args, **(kwargs or {})):
+            if isinstance(gap, Tensor) and gap.requires_grad:
+                self.gaps.append(gap)
+        return result
+
+
+def _gaps(name: str, x: Any = None, *args: Any, **kwargs: Any) -> list[Any]:
+    if not isinstance(x, Tensor) or not x.is_floating_point():
+        return []
+    if name in ("relu", "leaky_relu", "abs", "absolute", "elu", "__abs__"):
+        return [x]
+    if name in ("maximum", "minimum", "fmax", "fmin", "max", "min") and args:
+        return [x - args[0]]
+    if name in ("clamp", "clip", "clamp_min", "clamp_max", "hardtanh", "relu6"):
+        limits = (0.0, 6.0) if name == "relu6" else (*args, *kwargs.values()) or (-1.0, 1.0)
+        return [x - v for v in limits if isinstance(v, Tensor) or (type(v) in (int, float) and math.isfinite(v))]
+    return []
+
+
+def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
+    """Points ``(B, n)``, ``(B, d)`` of the boxes at and beside the thresholds of the program's clamps, relus and so on.
+
+    Newton's method on the distance to each threshold (at most 32, from 4 points each) finds them.
+    """
+    both = Box(torch.cat([start.lower, disturbance.lower]), torch.cat([start.upper, disturbance.upper]))
+    sizes = [start.dim, disturbance.dim]
+
+    def gaps(z: Tensor) -> Tensor | None:
+        with torch.enable_grad(), _Kinks() as kinks:
+            program.run(*z.split(sizes, dim=-1)).next
+        found = [g.reshape(len(z), -1) for g in kinks.gaps if g.shape[:1] == z.shape[:1]]
+        return torch.cat(found, -1) if found else None
+
+    z = both.sample(_STARTS, torch.Generator().manual_seed(3)).requires_grad_(True)
+    first = gaps(z)
+    if first is None:
+        return torch.zeros(0, sizes[0], dtype=torch.float64), torch.zeros(0, sizes[1], dtype=torch.float64)
+    columns = torch.arange(0, first.shape[1], -(-first.shape[1] // _KINKS))
+    z, own = z.detach().repeat(len(columns), 1), columns.repeat_interleave(_STARTS)[:, None]
+    towards = torch.zeros_like(z)
+    for _ in range(_NEWTON):
+        z = z.requires_grad_(True)
+        gap = gaps(z).gather(1, own)
+        (slope,) = torch.autograd.grad(gap.sum(), z)
+        towards = torch.nan_to_num(slope / slope.square().sum(-1, keepdim=True))
+        z = _inside(z.detach() - gap.detach() * towards, both)
+    points = torch.cat([_inside(z + around * towards, both) for around in _AROUND])
+    return points.split(sizes, dim=-1)
+
+
+def _inside(z: Tensor, box: Box) -> Tensor:
+    return torch.nan_to_num(torch.minimum(torch.maximum(z, box.lower), box.upper))
+
+
+def climbed(step: Step, program: Program, start: Box, disturbance: Box) -> tuple[Tensor, Tensor] | None:
+    """Points reached by gradient ascent on the difference of step and program; None if the step has no gradient."""
+    both = Box(torch.cat([start.lower, disturbance.lower]), torch.cat([start.upper, disturbance.upper]))
+    sizes = [start.dim, disturbance.dim]
+    z = both.sample(16 if step.rowwise else 4, torch.Generator().manual_seed(4))
+    visited = [z]
+    for _ in range(4):
+        z = z.detach().requires_grad_(True)
+        try:
+            with torch.enable_grad():
+                difference = step.differentiable(0, *z.split(sizes, dim=-1)) - program.run(*z.split(sizes, dim=-1)).next
+                (slope,) = torch.autograd.grad(difference.square().sum(), z)
+        except (RuntimeError, UsageError):
+            return None
+        z = _inside(z.detach() + 0.25 * both.width * torch.sign(torch.nan_to_num(slope)), both)
+        visited.append(z)
+    return torch.cat(visited).split(sizes, dim=-1)
