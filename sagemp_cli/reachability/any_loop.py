@@ -57,7 +57,7 @@ def reach(
     as torch computes it. A simulated rollout differs by its own rounding (most in float32), which is not enclosed.
 
     Not proved, but tested: that the step always does what it did when it was recorded (no hidden state, no randomness).
-    A step whose calls differ (a few dozen at random states, then up to 200 at one), that draws from the random
+    A step whose calls differ (a few dozen at random states, then 50 to 200 at one), that draws from the random
     generators shared by all, or that differs from the recorded program by more than rounding on simulated rollouts, at
     corners and centres of cells and of the tube's boxes, or near the program's thresholds, is refused. A change that
     shows only after more calls, or depends on a clock, is not noticed.

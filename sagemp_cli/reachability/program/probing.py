@@ -169,22 +169,25 @@ def reproduced(step: Step, xs: Tensor, ws: Tensor, before: Tensor) -> None:
             )
 
 
-REPEATED, SECONDS = 200, 0.05
-"""Calls at one state at the end, and the time after which there are no more."""
+REPEATED = (50, 200)
+"""Calls at one state at the end: at least, and at most."""
+
+SECONDS = 0.05
+"""Time after which there are no more than at least."""
 
 
 def steady(step: Step, x: Tensor, w: Tensor) -> None:
-    """Refuse a step whose result at one state changes within :data:`REPEATED` further calls."""
+    """Refuse a step whose result at one state changes when it is called again and again."""
     began = time.perf_counter()
     with torch.no_grad():
         first = step.at(0, x, w)
-        for _ in range(REPEATED):
+        for calls in range(REPEATED[1]):
             if not torch.equal(step.at(0, x, w), first):
                 raise UsageError(
                     "step gives another result when it is called again with the same x and w; it must be a function "
                     "of x and w only: no randomness, no counters, no state kept between calls"
                 )
-            if time.perf_counter() - began > SECONDS:
+            if calls >= REPEATED[0] and time.perf_counter() - began > SECONDS:
                 break
 
 
