@@ -131,7 +131,7 @@ def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, 
 
     def gaps(z: Tensor) -> Tensor | None:
         with torch.enable_grad(), _Kinks() as kinks:
-            program.run(*z.split(sizes, dim=-1)).next
+            program.run(*z.split(sizes, dim=-1))
         found = [g.reshape(len(z), -1) for g in kinks.gaps if g.shape[:1] == z.shape[:1]]
         return torch.cat(found, -1) if found else None
 
