@@ -1,4 +1,8 @@
-"""A limit on the time of a command, enforced the way Ctrl-C is, so that whatever resumes after one resumes."""
+"""A limit on the time of a command, enforced the way Ctrl-C is, so that whatever resumes after one resumes.
+
+A job in the background (``&`` in a script, nohup, cron) ignores Ctrl-C, not its time limit: there the signal is listened
+to for as long as the limit runs, and heeded only when it is the limit that raised it.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +34,13 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         ran_out = True
         signal.raise_signal(signal.SIGINT)
 
+    def heed_the_limit(*_: Any) -> None:
+        if ran_out:
+            raise KeyboardInterrupt
+
+    interrupt = signal.getsignal(signal.SIGINT)
+    if not callable(interrupt):
+        signal.signal(signal.SIGINT, heed_the_limit)
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
@@ -44,3 +55,5 @@ def time_limit(seconds: float | None) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+        if not callable(interrupt) and interrupt is not None:
+            signal.signal(signal.SIGINT, interrupt)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import time
 from pathlib import Path
 
 import pytest
 
+from sagemp_cli.cli.time_limit import time_limit
 from sagemp_cli.errors import EXIT_INTERRUPTED, EXIT_TIME_LIMIT
 from sagemp_cli.storage import atomic
 
@@ -122,25 +124,46 @@ def test_an_interrupt_has_its_exit_code_and_leaves_no_artifact(sagemp, made_up, 
     assert everything() == []
 
 
-def test_a_time_limit_stops_a_stage_like_an_interrupt(sagemp, monkeypatch):
+@pytest.fixture(params=["in the foreground", "in the background, where Ctrl-C is ignored"])
+def job(request):
+    before = signal.getsignal(signal.SIGINT)
+    if "background" in request.param:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_time_limit_stops_a_stage_like_an_interrupt(sagemp, monkeypatch, job):
     import sagemp_cli.stages.gen_data as stage
 
     cleaned = []
 
     def slow(context):
         try:
-            time.sleep(30)
+            time.sleep(3)
         except KeyboardInterrupt:
             cleaned.append(True)
             raise
 
     monkeypatch.setattr(stage, "run", slow)
-    began = time.monotonic()
+    handler = signal.getsignal(signal.SIGINT)
     result = sagemp("gen-data", "--time-limit", "0.2")
-    assert time.monotonic() - began < 20
+    assert signal.getsignal(signal.SIGINT) is handler
     assert result.exit_code == EXIT_TIME_LIMIT
     assert result.stderr.startswith("error: --time-limit 0.2 ran out: ")
     assert cleaned == [True]
+
+
+
+
+def test_ctrl_c_in_the_background_is_still_ignored_while_a_time_limit_runs():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with time_limit(60):
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_bug_is_one_line_unless_debugging_was_asked_for(sagemp, monkeypatch):
