@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sagemp_cli.cli.command import examples
-from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
+from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, Partitions, SampleSeed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import run_stage
 
 EXAMPLES = examples(
@@ -16,7 +16,7 @@ EXAMPLES = examples(
 def build_library(
     overrides: Overrides = None,
     partitions: Partitions = None,
-    seed: Seed = None,
+    seed: SampleSeed = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     time_limit: TimeLimit = None,
@@ -25,5 +25,5 @@ def build_library(
 
     Reads planner.h5 and tracker.h5 and writes library.h5; rejected references are counted by reason.
     """
-    given = overrides_of(overrides, seed=seed, partitions=partitions)
+    given = overrides_of(overrides, seed=seed, seed_of="library", partitions=partitions)
     run_stage("build-library", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit)

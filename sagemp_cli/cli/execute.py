@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sagemp_cli.cli.command import examples
-from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, Seed, TimeLimit, overrides_of
+from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, SampleSeed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import run_stage
 
 EXAMPLES = examples(
@@ -15,7 +15,7 @@ EXAMPLES = examples(
 
 def execute(
     overrides: Overrides = None,
-    seed: Seed = None,
+    seed: SampleSeed = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     time_limit: TimeLimit = None,
@@ -24,5 +24,5 @@ def execute(
 
     Reads library.h5, plans afresh from measured starts, rolls out under disturbances and writes rollouts.h5.
     """
-    given = overrides_of(overrides, seed=seed)
+    given = overrides_of(overrides, seed=seed, seed_of="execute")
     run_stage("execute", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit)

@@ -17,6 +17,10 @@ Overrides = Annotated[
     ),
 ]
 Seed = Annotated[int | None, typer.Option(help="Root of all random numbers; the same as seed=N.", show_default=False)]
+SampleSeed = Annotated[
+    int | None,
+    typer.Option("--seed", help="Of what this stage samples; trained files are not affected.", show_default=False),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the output if it exists already.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be read and written, and do nothing.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -39,14 +43,24 @@ Partitions = Annotated[
 ]
 
 
-def overrides_of(given: list[str] | None, *, seed: int | None = None, partitions: str | None = None) -> list[str]:
+def overrides_of(
+    given: list[str] | None, *, seed: int | None = None, partitions: str | None = None, seed_of: str = ""
+) -> list[str]:
     """All overrides of a call: the positional ones, and those that options stand for.
+
+    Args:
+        given: positional ones.
+        seed, partitions: values of the options.
+        seed_of: section whose seed ``--seed`` is; empty for the root of all.
 
     Raises:
         UsageError: an option and an override say two things about one key.
     """
     overrides = list(given or [])
-    for option, key, value in (("--seed", "seed", seed), ("--partitions", "verify.partitions", partitions)):
+    for option, key, value in (
+        ("--seed", f"{seed_of}.seed".lstrip("."), seed),
+        ("--partitions", "verify.partitions", partitions),
+    ):
         if value is None:
             continue
         if any(o.lstrip("+").startswith(f"{key}=") for o in overrides):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sagemp_cli.cli.command import examples
-from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
+from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, SampleSeed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import announce, output_of
 from sagemp_cli.errors import UsageError
 
@@ -32,7 +32,7 @@ def safety_rates(
         bool, typer.Option("--table", help="Run nothing: one table of all experiments in artifacts/ that were run.")
     ] = False,
     partitions: Partitions = None,
-    seed: Seed = None,
+    seed: SampleSeed = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -48,7 +48,7 @@ def safety_rates(
     from sagemp_cli.report.safety_table import all_safety_rows, safety_rows
     from sagemp_cli.storage import SafetyRates, read_artifact
 
-    given = overrides_of(overrides, seed=seed, partitions=partitions)
+    given = overrides_of(overrides, seed=seed, seed_of="safety", partitions=partitions)
     if table:
         if overwrite or dry_run or time_limit is not None:
             raise UsageError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +27,7 @@ def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext
     torch.set_num_threads(1)  # several processes with several threads each slow each other down many times over
     config = compose(overrides)
     require_sound_config(config)
-    return StageContext.of(config, overwrite=overwrite, progress=console_progress())
+    return StageContext.of(config, overwrite=overwrite, progress=console_progress(), typed=tuple(overrides))
 
 
 def run_stage(name: str, overrides: list[str], *, overwrite: bool, dry_run: bool, seconds: float | None) -> None:
@@ -52,14 +51,19 @@ def output_of(
         shown: what the command prints of an output that is up to date; without it such an output is in the way.
     """
     from sagemp_cli.pipeline.freshness import Freshness, survey
+    from sagemp_cli.pipeline.stage import stage_named
 
     context = context_of(overrides, overwrite=overwrite)
+    stage_named(name).require_own(context)
     states = survey(context, last=name)
     state = states[name]
     known = bool(shown) and state.freshness is Freshness.FRESH and not overwrite
+    if dry_run and state.freshness is Freshness.FRESH and not overwrite and not known:
+        typer.echo(f"sagemp {name} would do nothing: {state.path} is up to date; --overwrite remakes it")
+        return None
     if not known:
         _refuse_existing(state, overwrite)
-        _require_inputs(context, states, name, overrides)
+        _require_inputs(context, states, name)
     if dry_run:
         if known:
             typer.echo(f"sagemp {name} would print {shown} of {state.path}, which is up to date")
@@ -84,25 +88,22 @@ def _refuse_existing(state: FileState, overwrite: bool) -> None:
     raise ArtifactError(f"{state.path}: {what}; pass --overwrite to remake it ('sagemp run' skips what is up to date)")
 
 
-def _require_inputs(context: StageContext, states: dict[str, FileState], name: str, overrides: list[str]) -> None:
+def _require_inputs(context: StageContext, states: dict[str, FileState], name: str) -> None:
     """Raise if an input is not there, and say which command makes it."""
     from sagemp_cli.pipeline.freshness import Freshness
 
     read = states[name].stage.inputs_in(context.config)
     missing = [s for s in read if states[s].freshness is Freshness.MISSING]
     if missing:
-        said = "".join(f" {shlex.quote(o)}" for o in overrides)
         raise ArtifactError(
-            f"{states[missing[0]].path}: missing; {maker(context, missing[0], overrides)}"
-            f" (or 'sagemp run{said}', which makes everything that is missing)"
+            f"{states[missing[0]].path}: missing; {maker(context, missing[0])}"
+            f" (or '{context.command('run')}', which makes everything that is missing)"
         )
 
 
-def maker(context: StageContext, name: str, overrides: list[str]) -> str:
+def maker(context: StageContext, name: str) -> str:
     """The command that makes a stage's file, as it is typed: with this call's overrides, or in its own experiment."""
-    owner = context.owner(name)
-    said = overrides if owner is context else [f"experiment={owner.config['name']}"]
-    return f"make it with 'sagemp {name}{''.join(f' {shlex.quote(o)}' for o in said)}'"
+    return f"make it with '{context.owner(name).command(name)}'"
 
 
 def explain(context: StageContext, states: dict[str, FileState], name: str) -> None:

@@ -31,7 +31,7 @@ def status(
     context = context_of(given)
     states = survey(context)
     why = {
-        name: maker(context, name, given) if state.freshness is Freshness.MISSING else state.why
+        name: maker(context, name) if state.freshness is Freshness.MISSING else state.why
         for name, state in states.items()
     }
     if as_json:

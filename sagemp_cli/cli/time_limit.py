@@ -1,7 +1,7 @@
 """A limit on the time of a command, enforced the way Ctrl-C is, so that whatever resumes after one resumes.
 
-A job in the background (``&`` in a script, nohup, cron) ignores Ctrl-C, not its time limit: there the signal is listened
-to for as long as the limit runs, and heeded only when it is the limit that raised it.
+A job in the background (``&`` in a script, nohup, cron) ignores Ctrl-C, not its time limit: there the signal is
+listened to for as long as the limit runs, and heeded only when it is the limit that raised it.
 """
 
 from __future__ import annotations

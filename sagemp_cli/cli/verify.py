@@ -7,7 +7,7 @@ import json
 import typer
 
 from sagemp_cli.cli.command import examples, printable
-from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, Seed, TimeLimit, overrides_of
+from sagemp_cli.cli.options import DryRun, Json, Overrides, Overwrite, Partitions, SampleSeed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import output_of
 
 EXAMPLES = examples(
@@ -23,7 +23,7 @@ EXAMPLES = examples(
 def verify(
     overrides: Overrides = None,
     partitions: Partitions = None,
-    seed: Seed = None,
+    seed: SampleSeed = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -38,7 +38,7 @@ def verify(
     """
     from sagemp_cli.cli import verdict
 
-    given = overrides_of(overrides, seed=seed, partitions=partitions)
+    given = overrides_of(overrides, seed=seed, seed_of="verify", partitions=partitions)
     made = output_of("verify", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit, shown="the verdict")
     if made is None:
         return

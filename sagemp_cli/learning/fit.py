@@ -151,6 +151,8 @@ def fit(
     )
     if checkpoint is not None and checkpoint.exists():
         run.restore(read_checkpoint(checkpoint, identity=identity), checkpoint)
+        if progress is not None and 0 < run.done < steps:
+            progress.say(f"{description}: goes on from update {run.done} of {steps}")
 
     def save() -> None:
         if checkpoint is not None:

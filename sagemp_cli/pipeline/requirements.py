@@ -8,6 +8,7 @@ from typing import Any
 from sagemp_cli.config.binding import all_complaints, build
 from sagemp_cli.config.composition import options_of
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
+from sagemp_cli.pipeline.context import named_run_file
 from sagemp_cli.pipeline.options import key_complaints
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.pipeline.proof import partition_complaints
@@ -26,7 +27,7 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
         ConfigError: one line with every complaint.
     """
     found = all_complaints(config) + [complaint for stage in STAGES for complaint in stage.complaints(config)]
-    found += _source_complaints(config["sources"], str(config["name"]))
+    found += _source_complaints(config)
     found += key_complaints(config["start"], "start", ("center", "radius"))
     found += key_complaints(config["disturbance"], "disturbance", ("radius",))
     if problem and not any(complaint.startswith("dynamics") for complaint in found):
@@ -35,7 +36,8 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
         raise ConfigError("; ".join(dict.fromkeys(found)))
 
 
-def _source_complaints(sources: Any, own: str) -> Iterator[str]:
+def _source_complaints(config: Mapping[str, Any]) -> Iterator[str]:
+    sources, own = config["sources"], str(config["name"])
     shared = [stage.name for stage in STAGES if any(stage.name in other.inputs for other in STAGES)]
     experiments = options_of("experiment")
     if not isinstance(sources, Mapping):
@@ -47,11 +49,13 @@ def _source_complaints(sources: Any, own: str) -> Iterator[str]:
             yield f"sources.{stage}: no stage whose file another one could use{near}"
         if experiment is None:
             continue
-        if experiment not in experiments:
-            near = did_you_mean(str(experiment), experiments) or f"; known: {', '.join(experiments)}"
-            yield f"sources.{stage}: no experiment '{experiment}'{near}"
-        elif experiment == own:
+        if experiment == own:
             yield f"sources.{stage}: {own} is this experiment itself"
+        elif experiment not in experiments and (
+            stage not in shared or named_run_file(config, str(experiment), stage) is None
+        ):
+            near = did_you_mean(str(experiment), experiments) or f"; known: {', '.join(experiments)}"
+            yield f"sources.{stage}: no experiment '{experiment}'{near}, and no file of a run of that name"
 
 
 def _problem_complaints(config: Mapping[str, Any]) -> list[str]:

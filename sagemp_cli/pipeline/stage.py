@@ -44,6 +44,9 @@ class Stage:
         sections: dotted config keys that its output depends on, beyond those of its inputs.
         irrelevant: keys in these sections that only say where the work is done, and change nothing in the output.
         applies: whether an experiment has this stage at all, from its config.
+        variant: what distinguishes its output from the experiment's own, from its config; empty if nothing does.
+        seed: dotted key of its seed; that of a stage that only samples is its own, and another one is no contradiction
+            to what reads its file.
     """
 
     name: str
@@ -53,10 +56,21 @@ class Stage:
     sections: tuple[str, ...]
     irrelevant: tuple[str, ...] = ()
     applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
+    variant: Callable[[Mapping[str, Any]], str] = lambda config: ""
+    seed: str = "seed"
+
+    def output_in(self, config: Mapping[str, Any]) -> str:
+        """File name of what it writes under a config."""
+        variant = self.variant(config)
+        return f"{self.role}-{variant}.h5" if variant else self.output
 
     def inputs_in(self, config: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the stages whose outputs it reads in an experiment."""
         return tuple(name for name in self.inputs if stage_named(name).applies(config))
+
+    def seed_in(self, config: Mapping[str, Any]) -> int:
+        """Its seed under a config."""
+        return int(_value(config, self.seed, without=()))
 
     def settings(self, config: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:
         """What its output depends on in a config: its sections by their keys, None where one is absent.
@@ -67,9 +81,11 @@ class Stage:
         """
         return {key: _value(config, key, without=(*self.irrelevant, *without)) for key in self.sections}
 
-    def difference(self, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+    def difference(
+        self, found: Mapping[str, Any], wanted: Mapping[str, Any], *, without: Sequence[str] = ()
+    ) -> tuple[str, Any, Any] | None:
         """The first dotted key that its output depends on and that differs in two configs, with both values."""
-        before, now = self.settings(found), self.settings(wanted)
+        before, now = (self.settings(config, without=without) for config in (found, wanted))
         return next((_difference(key, before[key], now[key]) for key in now if before[key] != now[key]), None)
 
     @property
@@ -83,17 +99,25 @@ class Stage:
         Raises:
             ConfigError: another experiment makes the file, or the stage has :meth:`complaints`.
         """
-        owner = context.owner(self.name)
-        if owner is not context:
-            raise ConfigError(
-                f"sources.{self.name}: {context.config['name']} takes {self.output} from {owner.config['name']}; "
-                f"make it with 'sagemp {self.name} experiment={owner.config['name']}'"
-            )
+        self.require_own(context)
         refuse_existing(context.output_path(self.name), context.overwrite)
         wrong = self.complaints(context.config)
         if wrong:
             raise ConfigError("; ".join(wrong))
         return self._module.run(context)
+
+    def require_own(self, context: StageContext) -> None:
+        """Raise if the file comes from elsewhere.
+
+        Raises:
+            ConfigError: it does, and says which command makes it there.
+        """
+        owner = context.owner(self.name)
+        if owner is not context:
+            raise ConfigError(
+                f"sources.{self.name}: {context.config['name']} takes {self.output} from {owner.config['name']}; "
+                f"make it with '{owner.command(self.name)}'"
+            )
 
     def complaints(self, config: Mapping[str, Any]) -> list[str]:
         """What is wrong with the sections that this stage reads and no class is built from, one line each."""
@@ -112,6 +136,12 @@ def _has_demonstrations(config: Mapping[str, Any]) -> bool:
 def _learns_its_robot(config: Mapping[str, Any]) -> bool:
     """Whether the robot is a learned one."""
     return target_class(config["dynamics"], "dynamics") is Learned
+
+
+def _references_file(config: Mapping[str, Any]) -> str:
+    """The name of the file of references, whose certificate is not the experiment's own."""
+    file = config["verify"]["file"]
+    return "" if file is None else Path(file).stem
 
 
 _ROBOT = ("name", "dynamics", "scene", "horizon")
@@ -149,28 +179,33 @@ STAGES = (
         "certificate.h5",
         Certificate,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", "verify", "start", "disturbance", "seed"),
+        (*_ROBOT, "propagator", "verify", "start", "disturbance"),
+        variant=_references_file,
+        seed="verify.seed",
     ),
     Stage(
         "build-library",
         "library.h5",
         Library,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance", "seed"),
+        (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance"),
+        seed="library.seed",
     ),
     Stage(
         "execute",
         "rollouts.h5",
         Rollouts,
         ("train-dynamics", "train-planner", "train-tracker", "build-library"),
-        (*_ROBOT, "execute", "start", "disturbance", "seed"),
+        (*_ROBOT, "execute", "start", "disturbance"),
+        seed="execute.seed",
     ),
     Stage(
         "safety-rates",
         "safety.h5",
         SafetyRates,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", *_PARTITION, "library.start_spread", "safety", "start", "disturbance", "seed"),
+        (*_ROBOT, "propagator", *_PARTITION, "library.start_spread", "safety", "start", "disturbance"),
+        seed="safety.seed",
     ),
 )
 

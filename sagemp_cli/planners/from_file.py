@@ -17,6 +17,9 @@ from sagemp_cli.planners.trajectory_file import RecordedTrajectory, read_traject
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 
+_UNITS = ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds"))
+"""Units of time that loggers write, in a second's parts."""
+
 
 class FromFile(nn.Module):
     """Plans that are trajectories of a file; :mod:`~sagemp_cli.planners.trajectory_file` says which files.
@@ -109,6 +112,10 @@ class FromFile(nn.Module):
             filled.append(rows)
         return np.stack(filled)
 
+    def _plausible(self, seconds: float) -> bool:
+        """Whether a trajectory may last so long: within a factor of ten of the horizon."""
+        return 0.1 <= seconds / (self.horizon * self.dt) <= 10.0
+
     def _resampled(self, trajectory: RecordedTrajectory, path: Path) -> tuple[str, dict[str, np.ndarray]]:
         """A trajectory's name and its states at the robot's steps."""
         steps = self.dt * np.arange(self.horizon + 1)
@@ -123,9 +130,12 @@ class FromFile(nn.Module):
             time = steps
         lasts = float(time[-1] - time[0])
         if lasts > duration * (1 + 1e-9) + 0.5 * self.dt:
+            unit = next((name for factor, name in _UNITS if self._plausible(lasts / factor)), None)
+            wrong_unit = f"times are read in seconds, these look like {unit}; divide them"
+            remedy = wrong_unit if unit else f"set horizon={math.ceil(lasts / self.dt - 1e-9)} or shorten it"
             raise ArtifactError(
-                f"{where} lasts {lasts:g} s, but horizon is {self.horizon} steps of {self.dt:g} s, {duration:g} s; "
-                f"set horizon={math.ceil(lasts / self.dt - 1e-9)} or shorten it"
+                f"{where} lasts {lasts:.10g} s, but horizon is {self.horizon} steps of {self.dt:g} s, {duration:g} s; "
+                f"{remedy}"
             )
         if lasts < duration * (1 - 1e-9) - 0.5 * self.dt:
             self.notes.append(f"{trajectory.name} ends after {lasts:g} s and keeps its last row until {duration:g} s")

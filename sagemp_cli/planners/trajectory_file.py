@@ -194,4 +194,4 @@ def _require_sound(path: Path, trajectory: RecordedTrajectory) -> None:
     if trajectory.time is not None and not (np.diff(trajectory.time) > 0).all():
         row = int(np.argmin(np.diff(trajectory.time) > 0)) + 1
         before, now = trajectory.time[row - 1], trajectory.time[row]
-        raise ArtifactError(f"{where}: times must increase, but row {row} has {now:g} after {before:g}")
+        raise ArtifactError(f"{where}: times must increase, but row {row} has {now!s} after {before!s}")

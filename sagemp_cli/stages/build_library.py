@@ -76,7 +76,7 @@ def complaints(config: Mapping[str, Any]) -> list[str]:
     section = config["library"]
     least = section["size"] if is_whole(section.get("size"), 1) else 1
     return [
-        *key_complaints(section, "library", ("size", "budget", "start_spread")),
-        *number_complaints(section, "library", size=1, budget=least),
+        *key_complaints(section, "library", ("size", "budget", "seed", "start_spread")),
+        *number_complaints(section, "library", size=1, budget=least, seed=0),
         *spread_complaints(config),
     ]

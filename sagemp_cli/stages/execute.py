@@ -55,6 +55,6 @@ def run(context: StageContext) -> Path:
 
 def complaints(config: Mapping[str, Any]) -> list[str]:
     """What is wrong with the section ``execute``."""
-    least = {"queries": 1, "rollouts": 1}
+    least = {"queries": 1, "rollouts": 1, "seed": 0}
     section = config["execute"]
     return [*key_complaints(section, "execute", tuple(least)), *number_complaints(section, "execute", **least)]

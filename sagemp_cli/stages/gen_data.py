@@ -38,7 +38,7 @@ def run(context: StageContext) -> Path:
     count, options = section["count"], without(section, *_KEYS)
     weights = Weights(**section["weights"])
     expert = Expert(problem.dynamics.analytical, problem.scene, problem.horizon, weights, **options)
-    problems = plan_demonstrations(problem.start, count, seed=context.seed)
+    problems = plan_demonstrations(problem.start, count, seed=int(context.config["seed"]))
     # A demonstration does not depend on how many there are or who solves it, so these may change between runs.
     partial = PartialResults.of(context, "gen-data", without=("expert.count",))
     done = partial.finished & set(range(count))

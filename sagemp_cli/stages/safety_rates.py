@@ -86,8 +86,8 @@ def run(context: StageContext) -> Path:
 def complaints(config: Mapping[str, Any]) -> list[str]:
     """What is wrong with the section ``safety``, and with where references start."""
     section = config["safety"]
-    found = key_complaints(section, "safety", ("references", "rollouts", "within_limits"))
-    found += number_complaints(section, "safety", references=1, rollouts=1)
+    found = key_complaints(section, "safety", ("references", "rollouts", "seed", "within_limits"))
+    found += number_complaints(section, "safety", references=1, rollouts=1, seed=0)
     if not isinstance(section.get("within_limits"), bool):
         found.append(f"safety.within_limits must be true or false, found {section.get('within_limits')!r}")
     return found + spread_complaints(config)

@@ -16,6 +16,7 @@ from sagemp_cli.pipeline.proof import Proof
 from sagemp_cli.pipeline.reference_file import read_references
 from sagemp_cli.pipeline.true_model import TrueModelProof
 from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.planners.from_file import FromFile
 from sagemp_cli.planners.trajectory_file import REFERENCES
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
@@ -24,7 +25,7 @@ from sagemp_cli.verification.attack.falsifier import Counterexample as Found
 from sagemp_cli.verification.attack.refutation import attack, decided
 from sagemp_cli.verification.verdict import answer_of
 
-_KEYS = ("partitions", "budget", "memory", "references", "file", "falsifier", "true_model")
+_KEYS = ("partitions", "budget", "memory", "references", "seed", "file", "falsifier", "true_model")
 
 
 def run(context: StageContext) -> Path:
@@ -39,11 +40,13 @@ def run(context: StageContext) -> Path:
     tracker = tracker_from(tracker_file)
     inputs: tuple[Artifact[Any] | Parent, ...] = (planner_file, tracker_file, *robot_files)
     if section["file"] is None:
-        references = planner_from(planner_file).sample(
+        planner = planner_from(planner_file)
+        every = len(planner.trajectories) if isinstance(planner, FromFile) else 1
+        references = planner.sample(
             problem.start.center,
             problem.scene.goal,
             scene=problem.scene,
-            count=section["references"],
+            count=section["references"] or every,
             generator=context.generator("verify: references"),
         )
     else:
@@ -92,7 +95,8 @@ def complaints(config: Mapping[str, Any]) -> list[str]:
     if not wrong:
         least = {key: 1 if key == "at_once" else 0 for key in search or {}}
         wrong = number_complaints(search or {}, "verify.falsifier", **least)
-    return [*key_complaints(section, "verify", _KEYS), *number_complaints(section, "verify", references=1), *wrong]
+    least = {"seed": 0} if section["references"] is None else {"seed": 0, "references": 1}
+    return [*key_complaints(section, "verify", _KEYS), *number_complaints(section, "verify", **least), *wrong]
 
 
 def _counterexample(reference: int, found: Found, constraint: str) -> Counterexample:

@@ -151,6 +151,11 @@ def train_tracker(
     history = fit(tracker, plain, steps=steps, checkpoint=checkpoint, description="training the tracker", **common)
     if tube is None:
         return history
+    if progress is not None:
+        progress.say(
+            f"the tube's width joins the loss, with sets that grow from {tube.shrink:.0%} of their size to all of it: "
+            "so the loss rises now"
+        )
     later = None if checkpoint is None else checkpoint.with_name(f"{checkpoint.stem}-tube{checkpoint.suffix}")
     return history.then(
         fit(

@@ -154,8 +154,6 @@ def test_a_time_limit_stops_a_stage_like_an_interrupt(sagemp, monkeypatch, job):
     assert cleaned == [True]
 
 
-
-
 def test_ctrl_c_in_the_background_is_still_ignored_while_a_time_limit_runs():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -10,6 +10,7 @@ import pytest
 
 from sagemp_cli.config.composition import compose
 from sagemp_cli.pipeline.stage import STAGES, stages_of
+from sagemp_cli.storage import Rollouts, TrackerModel, read_artifact
 
 NAMES = [stage.name for stage in stages_of(compose([]))]
 FOLDER = Path("artifacts/unicycle_node")
@@ -300,3 +301,139 @@ def test_inspect_says_whether_the_content_is_what_was_written(sagemp, made_up):
     with h5py.File(path, "a") as file:
         file["data/tubes/clearance"][...] = 9.0
     assert "CHANGED since it was written" in sagemp("inspect", path).stdout
+
+
+def test_after_a_refuted_claim_no_library_is_built_and_the_code_is_that_of_the_verdict(sagemp, made_up):
+    made_up.certificate["verdict"] = "FALSIFIED"
+    result = sagemp("run")
+    assert result.exit_code == 10
+    assert made_up.ran == NAMES[: NAMES.index("verify") + 1]
+    assert "build-library, execute: not made, the claim is refuted" in result.stdout
+    assert "FALSIFIED: " in result.stdout
+    assert sagemp("run").exit_code == 10
+    assert made_up.ran == NAMES[: NAMES.index("verify") + 1]
+
+
+def test_the_verdict_is_shown_even_if_no_library_can_be_built(sagemp, made_up, monkeypatch):
+    import sagemp_cli.stages.build_library as stage
+    from sagemp_cli.library.builder import NothingCertifiedError
+
+    def nothing(context):
+        raise NothingCertifiedError("library: none of 60 sampled references could be certified")
+
+    monkeypatch.setattr(stage, "run", nothing)
+    made_up.certificate["verdict"] = "UNKNOWN"
+    result = sagemp("run")
+    assert result.exit_code == 5
+    assert "UNKNOWN: 0 of 1 references certified" in result.stdout
+    assert result.stderr.startswith("error: library: none of 60")
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "verify"])
+def test_a_dry_run_of_a_stage_that_is_up_to_date_is_no_error(sagemp, made_up, name):
+    sagemp("run")
+    made_up.ran.clear()
+    result = sagemp(name, "--dry-run")
+    assert result.exit_code == 0
+    path = FOLDER / next(s.output for s in STAGES if s.name == name)
+    assert result.stdout == f"sagemp {name} would do nothing: {path} is up to date; --overwrite remakes it\n"
+    assert made_up.ran == []
+
+
+def test_a_hint_acts_on_the_same_experiment_and_config_as_the_call(sagemp, made_up):
+    given = ("experiment=kinematic_node", "effort=demo")
+    sagemp("run", "--until", "train-tracker", *given)
+    result = sagemp("verify", *given, "tracker.lookahead=7")
+    assert result.exit_code == 2
+    remake = "sagemp train-tracker experiment=kinematic_node effort=demo tracker.lookahead=7 --overwrite"
+    assert f"remake it with '{remake}', drop the override" in result.stderr
+    missing = sagemp("execute", *given).stderr
+    assert "make it with 'sagemp build-library experiment=kinematic_node effort=demo'" in missing
+    assert "(or 'sagemp run experiment=kinematic_node effort=demo'" in missing
+    sagemp("gen-data", *given, "--overwrite")
+    changed = sagemp("train-tracker", *given, "--overwrite").stderr
+    assert "remake it with 'sagemp train-planner experiment=kinematic_node effort=demo --overwrite'" in changed
+
+
+def test_a_hint_to_another_experiments_file_keeps_effort_and_folder(sagemp):
+    result = sagemp("train-tracker", "experiment=planar_cfm", "effort=demo", "artifacts=there", "seed=3")
+    assert result.exit_code == 2
+    maker = "sagemp train-tracker experiment=planar_node effort=demo artifacts=there seed=3"
+    assert f"planar_cfm takes tracker.h5 from planar_node; make it with '{maker}'" in result.stderr
+
+
+def test_another_start_box_on_trained_files_is_answered_with_a_run_of_another_name_and_that_works(sagemp, made_up):
+    sagemp("run")
+    other = "start.radius=[0.5,0.5,0,0]"
+    answer = "name=NAME sources.train-planner=unicycle_node sources.train-tracker=unicycle_node"
+    refused = sagemp("verify", other, "--overwrite")
+    assert refused.exit_code == 2
+    assert f", or use it as it is in a run of another name: {answer}" in refused.stderr
+    made_up.ran.clear()
+    assert sagemp("run", other, *answer.replace("NAME", "mine").split()).exit_code == 0
+    assert made_up.ran == ["verify", "build-library", "execute"]
+    assert Path("artifacts/mine/certificate.h5").exists()
+
+
+def test_a_run_with_a_name_of_its_own_can_be_a_source(sagemp, made_up):
+    sagemp("run", "--until", "verify", "name=d1", "tracker.lookahead=7")
+    made_up.ran.clear()
+    given = ("name=d2", "sources.train-planner=d1", "sources.train-tracker=d1", "start.radius=[0.5,0.5,0,0]")
+    result = sagemp("run", "--until", "verify", *given)
+    assert result.exit_code == 0, result.stderr
+    assert made_up.ran == ["verify"]
+    assert "d1: train-tracker: up to date (artifacts/d1/tracker.h5)" in result.stdout
+    assert sagemp("verify", *given).stdout.startswith("up to date")
+
+
+@pytest.mark.parametrize("name", ["d9", "../unicycle_node", ".hidden", "d1/.."])
+def test_a_source_that_names_nothing_is_refused(sagemp, made_up, name):
+    sagemp("run", "--until", "train-tracker", "name=d1")
+    result = sagemp("run", "name=d2", f"sources.train-tracker={name}")
+    assert result.exit_code == 2
+    assert f"sources.train-tracker: no experiment '{name}'" in result.stderr
+    assert "no file of a run of that name" in result.stderr
+
+
+def test_run_keeps_the_earlier_file_of_what_it_trains_again(sagemp, made_up):
+    sagemp("run")
+    before = (FOLDER / "tracker.h5").read_bytes()
+    result = sagemp("run", "tracker.lookahead=7")
+    assert (FOLDER / "tracker-before.h5").read_bytes() == before
+    assert f"train-tracker: the earlier file is kept as {FOLDER}/tracker-before.h5" in result.stdout
+    assert not (FOLDER / "certificate-before.h5").exists()
+
+
+def test_run_does_not_replace_a_file_of_another_experiment_that_was_put_there_by_hand(sagemp, made_up):
+    sagemp("run", "--until", "train-tracker", "name=other")
+    sagemp("run", "--until", "train-planner")
+    path = FOLDER / "tracker.h5"
+    path.write_bytes(Path("artifacts/other/tracker.h5").read_bytes())
+    before = path.read_bytes()
+    result = sagemp("run")
+    assert result.exit_code == 2
+    assert f"error: {path}: is of 'other' and was put there by hand, 'sagemp run' does not replace it" in result.stderr
+    assert "move it away, or say sources.train-tracker=other" in result.stderr
+    assert path.read_bytes() == before
+
+
+def test_the_certificate_of_a_file_of_references_is_not_the_experiments_own(sagemp, made_up):
+    sagemp("run", "--until", "verify")
+    before = (FOLDER / "certificate.h5").read_bytes()
+    result = sagemp("verify", "verify.file=some/plans.npz")
+    assert result.exit_code == 0, result.stderr
+    assert f"certificate {FOLDER}/certificate-plans.h5" in result.stdout
+    assert (FOLDER / "certificate.h5").read_bytes() == before
+    assert sagemp("verify", "verify.file=some/plans.npz").stdout.startswith("up to date")
+
+
+def test_stages_that_sample_take_another_seed_on_the_same_trained_files(sagemp, made_up):
+    sagemp("run")
+    made_up.ran.clear()
+    for name in ("verify", "build-library", "execute"):
+        result = sagemp(name, "--seed", "3", "--overwrite")
+        assert result.exit_code == 0, result.stderr
+    assert made_up.ran == ["verify", "build-library", "execute"]  # with a library that was drawn with another seed
+    assert read_artifact(FOLDER / "rollouts.h5", Rollouts).header.seed == 3
+    assert read_artifact(FOLDER / "tracker.h5", TrackerModel).header.seed == 0
+    assert sagemp("verify", "--seed", "4").exit_code == 2  # nothing that exists is replaced unasked

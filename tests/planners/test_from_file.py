@@ -102,6 +102,15 @@ def test_trajectories_that_do_not_fit_the_horizon_are_one_line(tmp_path):
         FromFile(path=str(path), **OPTIONS)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")])
+def test_times_in_another_unit_are_not_answered_with_a_horizon_of_millions(tmp_path, factor, unit):
+    path = tmp_path / "plan.csv"
+    path.write_text(f"t,px,py\n{1.7e9 * factor:.0f},0,0\n{(1.7e9 + 1) * factor:.0f},1,1\n")
+    with pytest.raises(ArtifactError, match=f"times are read in seconds, these look like {unit}; divide them") as found:
+        FromFile(path=str(path), **OPTIONS)
+    assert "set horizon" not in str(found.value)
+
+
 def test_a_file_must_be_named():
     with pytest.raises(ConfigError, match="planner.path must name a file of trajectories, e.g. planner.path=plans.csv"):
         FromFile(**OPTIONS)

@@ -72,7 +72,11 @@ def test_rows_of_a_csv_belong_to_the_trajectory_that_they_name(tmp_path):
         ("t,px,py\n0,1,nan\n1,2,3\n", "trajectory has py = nan in row 0; numbers must be finite"),
         ("t,px,py\n0,1,2\n1,inf,3\n", "trajectory has px = inf in row 1; numbers must be finite"),
         ("t,px,py\n0,1,2\n", "trajectory has 1 rows; at least two are needed"),
-        ("t,px,py\n0,1,2\n1,1,2\n1,2,3\n", "trajectory: times must increase, but row 2 has 1 after 1"),
+        ("t,px,py\n0,1,2\n1,1,2\n1,2,3\n", "trajectory: times must increase, but row 2 has 1.0 after 1.0"),
+        (
+            "t,px,py\n1732780000.25,1,2\n1732780000.125,2,3\n",
+            "times must increase, but row 1 has 1732780000.125 after 1732780000.25",
+        ),
         ("t,px,py,px\n0,1,2,3\n", "has two columns 'px'"),
         (
             "t,px,pi\n0,1,2\n1,2,3\n",
