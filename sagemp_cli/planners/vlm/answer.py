@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+from pydantic_core import from_json
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.scenes.frame import Frame
@@ -18,7 +18,12 @@ LONGEST_ANSWER = 100_000
 """Characters; nothing longer is looked at."""
 
 DEEPEST = 100
-"""Brackets open at a time, at most."""
+"""Brackets open at a time, at most: seen before a parser gets them, whatever its own limit is."""
+MOST_LOOKS = 20
+"""How often the longest answer is looked through at most, in search of where its JSON begins."""
+_OPENING = re.compile(r"[\[{]")
+_TOKENS = re.compile(r'"(?:[^"\\]+|\\.)*+"?|[\[{\]}]', re.DOTALL)
+"""Strings, the last of which may be cut off, and brackets."""
 _ON_THE_EDGE = 1e-6
 _REFUSALS = re.compile(r"\b(can(?:no|['’])t|unable|won['’]t|will not|not able|sorry|refuse|apolog)", re.IGNORECASE)
 
@@ -82,20 +87,20 @@ def _refuse_outside(points: NDArray[np.float64], low: NDArray, high: NDArray, wh
 
 def _listed(text: str) -> list[Any]:
     """The first list of the text's JSON that can be waypoints."""
-    depth = 0
-    for bracket in re.findall(r"[\[{\]}]", text):
-        depth = depth + 1 if bracket in "[{" else max(0, depth - 1)
-        if depth > DEEPEST:  # before the decoder sees it: it would start again at each of them
-            raise AnswerError("the answer's JSON is nested too deep")
-    decoder, opens, seen, position = json.JSONDecoder(), re.compile(r"[\[{]"), [], 0
-    while (opening := opens.search(text, position)) is not None:
-        try:
-            value, position = decoder.raw_decode(text, opening.start())
-        except RecursionError:
-            raise AnswerError("the answer's JSON is nested too deep") from None
-        except ValueError:  # no JSON here, or a number of thousands of digits
-            position = opening.end()
+    seen, position, looked_at = [], 0, 0
+    while (opening := _OPENING.search(text, position)) is not None:
+        end = _end_of(text, opening.start())
+        looked_at += (end or len(text)) - opening.start()
+        if looked_at > MOST_LOOKS * LONGEST_ANSWER:
+            raise AnswerError("the answer is a tangle of brackets")
+        position = opening.end()
+        if end is None:
             continue
+        try:
+            value = from_json(text[opening.start() : end])
+        except ValueError:  # no JSON here, or a number of thousands of digits
+            continue
+        position = end
         seen.append(value)
         listed = _waypoint_list(value)
         if listed is not None:
@@ -108,6 +113,21 @@ def _listed(text: str) -> list[Any]:
     if '"waypoints"' in text:
         raise AnswerError(f"the answer's JSON is broken or cut off, found {_short(text)}")
     raise AnswerError(f"the answer holds no JSON object, found {_short(text)}")
+
+
+def _end_of(text: str, start: int) -> int | None:
+    """Where the bracket at ``start`` is closed; None if it never is. Brackets in strings do not count."""
+    depth = 0
+    for token in _TOKENS.finditer(text, start):
+        if token.group() in ("[", "{"):
+            depth += 1
+        elif token.group() in ("]", "}"):
+            depth -= 1
+        if depth == 0:
+            return token.end()
+        if depth > DEEPEST:
+            raise AnswerError("the answer's JSON is nested too deep")
+    return None
 
 
 def _waypoint_list(value: Any) -> list[Any] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -17,23 +18,21 @@ from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.vlm.answer import MOST_WAYPOINTS, AnswerError, waypoints_of
-from sagemp_cli.planners.vlm.gemini import Gemini
 from sagemp_cli.planners.vlm.lessons import Lessons, answer_figures
 from sagemp_cli.planners.vlm.local import Local
 from sagemp_cli.planners.vlm.network import SceneReader
-from sagemp_cli.planners.vlm.openai import OpenAI
 from sagemp_cli.planners.vlm.practice import practice_of, random_exercise
 from sagemp_cli.planners.vlm.prompts import axes_of, fill, template
 from sagemp_cli.planners.vlm.question import Question
-from sagemp_cli.planners.vlm.replay import Replay
-from sagemp_cli.planners.vlm.service import Service, ServiceOptions
+from sagemp_cli.planners.vlm.recording import Replay
+from sagemp_cli.planners.vlm.service import ENDPOINTS, Service, ServiceOptions
 from sagemp_cli.planners.vlm.waypoints import Drive, reference_of
 from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.frame import Frame
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 
-PROVIDERS = ("local", "gemini", "openai", "replay")
+PROVIDERS = ("local", *ENDPOINTS, "replay")
 SERVICE_PLANS = 4
 """Plans that are asked of a service for model cards and figures, where others give hundreds."""
 _SHOWN = 32
@@ -77,7 +76,7 @@ class VLM(nn.Module):
         service: options of :class:`~sagemp_cli.planners.vlm.service.ServiceOptions`.
         network: options of :class:`~sagemp_cli.planners.vlm.network.SceneReader`.
         diversity: of the stand-in's answers: 0 always the cheapest way, about 1 other sides as well.
-        recording: file of recorded answers.
+        recording: file of recorded answers, or a folder of them, such as a service's cache.
     """
 
     learns_from: str = "scenes"
@@ -121,7 +120,7 @@ class VLM(nn.Module):
         self.drive = Drive(**options_for(Drive, drive, "planner.drive"))
         self.service = ServiceOptions(**options_for(ServiceOptions, service, "planner.service"))
         self.learns_from = "scenes" if provider == "local" else "nothing"
-        if provider in ("gemini", "openai"):
+        if provider in ENDPOINTS:
             self.affordable_plans = SERVICE_PLANS
         self.network = dict(network or {})
         self.reader = (
@@ -155,7 +154,7 @@ class VLM(nn.Module):
         if self.provider_name == "replay":
             assert self.recording is not None
             return Replay(Path(self.recording))
-        return Service(Gemini() if self.provider_name == "gemini" else OpenAI(), self.service)
+        return Service(ENDPOINTS[self.provider_name], self.service)
 
     @staticmethod
     def stand_in(section: Mapping[str, Any]) -> str:
@@ -209,7 +208,9 @@ class VLM(nn.Module):
 
     def _question(self, place: np.ndarray, target: np.ndarray, scene: Scene, frame: Frame) -> Question:
         numbers = {"start": frame.to_image(place).tolist(), "goal": frame.to_image(target).tolist()}
-        return Question(fill(template(self.prompt), **numbers), scene, frame, place, target)
+        text = template(self.prompt)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return Question(fill(text, **numbers), digest, scene, frame, place, target)
 
     def learn(
         self,

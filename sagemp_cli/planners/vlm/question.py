@@ -18,6 +18,7 @@ class Question:
 
     Attributes:
         text: the prompt with its numbers.
+        prompt_hash: SHA-256 of the prompt's template, without numbers: what a recording is checked against.
         scene: what the picture shows.
         frame: the picture's coordinates, in which waypoints are answered.
         start: place of the start, metres ``(2,)``.
@@ -25,6 +26,7 @@ class Question:
     """
 
     text: str
+    prompt_hash: str
     scene: Scene
     frame: Frame
     start: NDArray[np.float64]

@@ -1,33 +1,34 @@
-"""A vision-language model behind a network: one careful HTTPS request, repeated where that can help, and a cache."""
+"""A vision-language model behind a network: a key, questions that are repeated where that can help, and a cache."""
 
 from __future__ import annotations
 
+import base64
 import hashlib
-import http.client
+import importlib.util
 import json
 import math
 import os
+import re
 import time
-import urllib.error
-import urllib.request
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import torch
 
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm.question import Question
-from sagemp_cli.storage.atomic import write_whole
+from sagemp_cli.planners.vlm.recording import Recording, read_recording, write_recording
+from sagemp_cli.planners.vlm.request import Outcome, ask_in_process
 
 TEMPORARY = (408, 429, 500, 502, 503, 504)
 """HTTP statuses after which the same request may succeed."""
-LONGEST_REPLY = 2**22
-"""Bytes of a reply that are read."""
+SHORTEST_KEY = 8
+"""Characters; what is shorter could not be taken out of an answer without taking it apart."""
 
 
 class ServiceError(UsageError):
@@ -39,11 +40,11 @@ class ServiceOptions:
     """How a service is called.
 
     Attributes:
-        model: its name there; None for the dialect's default.
-        base_url: where the service is; None for the dialect's public one.
+        model: its name there; None for the provider's default.
+        base_url: where the service is; None for the provider's public one.
         temperature: of the sampling.
         image_height: pixels of the picture that is sent.
-        timeout: seconds that one request may take.
+        timeout: seconds that one request may take, from its process's start to the last byte.
         time_limit: seconds that a question may take with all repetitions and pauses.
         retries: repetitions after a temporary failure.
         backoff: seconds before the first repetition; doubled each time; a service's Retry-After counts if longer.
@@ -71,57 +72,69 @@ class ServiceOptions:
                 "planner.service: retries and temperature must not be negative, image_height at least 16, "
                 f"found {self.retries}, {self.temperature} and {self.image_height}"
             )
-        if self.base_url is not None and urlsplit(self.base_url).scheme not in ("http", "https"):
-            raise ConfigError(f"planner.service.base_url must begin with http:// or https://, found '{self.base_url}'")
+        if self.base_url is not None:
+            _complain_about(self.base_url)
 
 
-class Dialect(Protocol):
-    """What differs between services: how a question and its answer are written down.
+@dataclass(frozen=True)
+class Endpoint:
+    """A service that speaks OpenAI's chat completions.
 
     Attributes:
         name: of the provider.
         key_variable: environment variable that holds the key.
         base_url: of the public service.
         model: the default one.
+        takes_seed: whether it knows the parameter ``seed``; Gemini refuses requests with it.
     """
 
     name: str
     key_variable: str
     base_url: str
     model: str
+    takes_seed: bool
 
-    def request(
-        self, base_url: str, model: str, key: str, *, text: str, png: bytes, temperature: float, seed: int
-    ) -> tuple[str, dict[str, str], dict[str, Any]]:
-        """Address, headers and body of the request for one answer."""
 
-    def answer(self, reply: Mapping[str, Any]) -> str:
-        """The text of a reply; empty if the model gave none."""
+ENDPOINTS = {
+    e.name: e
+    for e in (
+        Endpoint(
+            "gemini",
+            "GEMINI_API_KEY",
+            "https://generativelanguage.googleapis.com/v1beta/openai",
+            model="gemini-2.5-pro",  # the paper's
+            takes_seed=False,
+        ),
+        Endpoint("openai", "OPENAI_API_KEY", "https://api.openai.com/v1", model="gpt-4o", takes_seed=True),
+    )
+}
+"""The services by the names of their providers."""
 
 
 @dataclass(frozen=True)
 class Service:
     """A provider that asks a service.
 
-    The key comes from the environment and nowhere else: it is in no config, no artifact, no cache and no message.
+    The key comes from the environment and nowhere else. It is in no config, artifact, cache or message: what the
+    service says is freed of it in :mod:`~sagemp_cli.planners.vlm.request`, before it gets here.
 
     Attributes:
-        dialect: how the service is spoken to.
+        endpoint: which one.
         options: address, model and limits.
     """
 
-    dialect: Dialect
+    endpoint: Endpoint
     options: ServiceOptions
 
     @property
     def model(self) -> str:
         """The model that is asked."""
-        return self.options.model or self.dialect.model
+        return self.options.model or self.endpoint.model
 
     @property
     def label(self) -> str:
         """What answers, for figures."""
-        return f"{self.dialect.name}: {self.model}"
+        return f"{self.endpoint.name}: {self.model}"
 
     def answers(self, questions: Sequence[Question], *, generator: torch.Generator) -> list[str]:
         """One answer per question; equal questions get a seed each, so answers may differ.
@@ -138,145 +151,111 @@ class Service:
         png = question.png(self.options.image_height)
         path = self._cached(question.text, png, seed)
         if path is not None and path.exists():
-            return _read_cached(path)
-        base_url = (self.options.base_url or self.dialect.base_url).rstrip("/")
-        key = os.environ.get(self.dialect.key_variable, "").strip()
-        if not key and self.options.base_url is None:
+            return read_recording(path).answers[0]
+        if importlib.util.find_spec("openai") is None:
             raise ServiceError(
-                f"planner.provider '{self.dialect.name}' needs a key in the environment variable "
-                f"{self.dialect.key_variable}; without one use planner.provider=local (a stand-in) or replay"
+                f"planner.provider '{self.endpoint.name}' needs the package openai; install sagemp with its extra 'vlm'"
             )
-        url, headers, body = self.dialect.request(
-            base_url, self.model, key, text=question.text, png=png, temperature=self.options.temperature, seed=seed
-        )
-        reply = _Call(self.dialect, self.options, key).reply(url, headers, body)
-        try:
-            answer = self.dialect.answer(reply)
-        except (KeyError, IndexError, TypeError, AttributeError):
-            keys = ", ".join(map(str, reply)) or "nothing"
-            raise ServiceError(f"{self.dialect.name}: the reply is not what the protocol says, found {keys}") from None
+        request = {
+            "base_url": (self.options.base_url or self.endpoint.base_url).rstrip("/"),
+            "key": self._key(),
+            "model": self.model,
+            "text": question.text,
+            "png": base64.b64encode(png).decode(),
+            "temperature": self.options.temperature,
+            "seed": seed if self.endpoint.takes_seed else None,
+        }
+        answer = self._asked(request)
         if path is not None:
-            record = {"model": self.model, "seed": seed, "prompt": question.text, "answer": answer}
-            write_whole(path, json.dumps(record, indent=1).encode(), overwrite=True)
+            today = datetime.now(UTC).date().isoformat()
+            write_recording(path, Recording((answer,), self.model, today, question.prompt_hash))
         return answer
 
     def _cached(self, text: str, png: bytes, seed: int) -> Path | None:
         """Where the answer to a question is kept: by a hash of all that could change it."""
         if self.options.cache is None:
             return None
-        asked = [self.dialect.name, self.options.base_url, self.model, self.options.temperature, seed, text]
+        asked = [self.endpoint.name, self.options.base_url, self.model, self.options.temperature, seed, text]
         digest = hashlib.sha256(json.dumps(asked).encode())
         digest.update(png)
         return Path(self.options.cache) / f"{digest.hexdigest()}.json"
 
+    def _key(self) -> str:
+        """The key, or "" where a server of one's own is asked without one."""
+        name, key = self.endpoint.key_variable, os.environ.get(self.endpoint.key_variable, "")
+        if not key and self.options.base_url is None:
+            raise ServiceError(
+                f"planner.provider '{self.endpoint.name}' needs a key in the environment variable "
+                f"{name}; without one use planner.provider=local (a stand-in) or replay"
+            )
+        if key and re.fullmatch(r"[!-~]+", key) is None:
+            raise ServiceError(f"the key in {name} must be visible ASCII characters without spaces or line breaks")
+        if key and len(key) < SHORTEST_KEY:
+            raise ServiceError(
+                f"the key in {name} has {len(key)} characters, at least {SHORTEST_KEY} are needed; "
+                "unset it for a server that asks for none"
+            )
+        return key
 
-def _read_cached(path: Path) -> str:
-    try:
-        answer = json.loads(path.read_text(encoding="utf-8"))["answer"]
-    except (OSError, ValueError, KeyError, TypeError):
-        answer = None
-    if not isinstance(answer, str):
-        raise ServiceError(f"{path}: is no cached answer; delete it to ask again")
-    return answer
-
-
-@dataclass(frozen=True)
-class _Call:
-    """One question's requests, until a reply, a final refusal or the end of the time."""
-
-    dialect: Dialect
-    options: ServiceOptions
-    key: str
-
-    def reply(self, url: str, headers: dict[str, str], body: dict[str, Any]) -> Mapping[str, Any]:
-        """The reply's JSON object."""
-        request = urllib.request.Request(
-            url, json.dumps(body).encode(), {"Content-Type": "application/json", **headers}, method="POST"
-        )
-        deadline = time.monotonic() + self.options.time_limit
-        pause = self.options.backoff
+    def _asked(self, request: dict[str, Any]) -> str:
+        """The answer to a request, repeated until there is one, a final refusal, or the end of the time."""
+        deadline, pause = time.monotonic() + self.options.time_limit, self.options.backoff
         for attempt in range(self.options.retries + 1):
-            trouble, wait = "", 0.0
-            try:
-                return _object(self._body(request, deadline), self.dialect.name)
-            except urllib.error.HTTPError as e:
-                message = self._message(e)
-                if e.code in (401, 403) or "API_KEY_INVALID" in message or "API key not valid" in message:
-                    raise ServiceError(
-                        f"{self.dialect.name}: the key in {self.dialect.key_variable} is refused ({e.code}: {message})"
-                    ) from None
-                if e.code not in TEMPORARY:
-                    raise ServiceError(f"{self.dialect.name}: the request is refused ({e.code}: {message})") from None
-                trouble, wait = f"{e.code}: {message}", _retry_after(e.headers.get("Retry-After"))
-            except TimeoutError:
-                trouble = f"no reply within {self.options.timeout:g} s"
-            except (urllib.error.URLError, OSError, http.client.HTTPException) as e:
-                reason = getattr(e, "reason", e)
-                late = isinstance(reason, TimeoutError)
-                trouble = f"no reply within {self.options.timeout:g} s" if late else self._clean(str(reason))
-            wait = max(wait, pause)
+            seconds = min(self.options.timeout, deadline - time.monotonic())
+            outcome = ask_in_process(request, max(seconds, 0.0))
+            if outcome is None:
+                outcome = {"lost": f"no reply within {seconds:.3g} s"}
+            if "answer" in outcome:
+                return outcome["answer"]
+            trouble = self._trouble(outcome)
+            wait = max(_retry_after(outcome.get("retry_after")), pause)
             if attempt == self.options.retries:
-                raise ServiceError(f"{self.dialect.name}: gave up after {attempt + 1} requests ({trouble})")
-            if time.monotonic() + wait > deadline:
+                raise ServiceError(f"{self.endpoint.name}: gave up after {attempt + 1} requests ({trouble})")
+            if time.monotonic() + wait >= deadline:
                 raise ServiceError(
-                    f"{self.dialect.name}: gave up after {attempt + 1} requests, the next would come after the time "
+                    f"{self.endpoint.name}: gave up after {attempt + 1} requests, the next would come after the time "
                     f"limit of {self.options.time_limit:g} s ({trouble})"
                 )
             time.sleep(wait)
             pause *= 2
         raise AssertionError("the last attempt returns or raises")
 
-    def _body(self, request: urllib.request.Request, deadline: float) -> bytes:
-        """The reply's bytes; slow as a whole is late too, not only between two bytes."""
-        until = min(deadline, time.monotonic() + self.options.timeout)
-        parts, size = [], 0
-        with _OPENER.open(request, timeout=max(0.001, until - time.monotonic())) as response:
-            while part := response.read1(65536):
-                parts.append(part)
-                size += len(part)
-                if size > LONGEST_REPLY:
-                    raise ServiceError(f"{self.dialect.name}: the reply is longer than {LONGEST_REPLY} bytes")
-                if time.monotonic() > until:
-                    raise TimeoutError
-        return b"".join(parts)
+    def _trouble(self, outcome: Outcome) -> str:
+        """What went wrong, if another try may help.
 
-    def _message(self, error: urllib.error.HTTPError) -> str:
-        """What the service says of an error, shortened, without the key."""
-        try:
-            text = error.read(4096).decode("utf-8", "replace")
-        except (OSError, http.client.HTTPException):
-            text = ""
-        try:
-            said = json.loads(text)["error"]
-            text = str(said["message"]) if isinstance(said, dict) else str(said)
-        except (ValueError, KeyError, TypeError):
-            pass
-        return self._clean(text) or error.reason or "no message"
-
-    def _clean(self, text: str) -> str:
-        text = " ".join(text.split())
-        text = text.replace(self.key, "<key>") if self.key else text
-        return "".join(c if c.isprintable() else "?" for c in text)[:200]
+        Raises:
+            ServiceError: none can.
+        """
+        name = self.endpoint.name
+        if "wrong" in outcome:
+            raise ServiceError(f"{name}: {_line(outcome['wrong'])}")
+        if "lost" in outcome:
+            return _line(outcome["lost"])
+        said = f"{outcome['status']}: {_line(outcome['message']) or 'no message'}"
+        if outcome["status"] in (401, 403) or "API key not valid" in said:
+            raise ServiceError(f"{name}: the key in {self.endpoint.key_variable} is refused ({said})")
+        if outcome["status"] not in TEMPORARY:
+            raise ServiceError(f"{name}: the request is refused ({said})")
+        return said
 
 
-class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Refuses redirects: they would carry the key somewhere else."""
-
-    def redirect_request(self, *unused: Any) -> None:
-        return None
-
-
-_OPENER = urllib.request.build_opener(_NoRedirect)
-
-
-def _object(body: bytes, name: str) -> Mapping[str, Any]:
+def _complain_about(base_url: str) -> None:
     try:
-        reply = json.loads(body)
-    except (ValueError, RecursionError):
-        raise ServiceError(f"{name}: the reply is not JSON, found {body[:60]!r}") from None
-    if not isinstance(reply, dict):
-        raise ServiceError(f"{name}: the reply is not a JSON object, found {type(reply).__name__}")
-    return reply
+        url = urlsplit(base_url)
+        bad = url.scheme not in ("http", "https") or not url.hostname or url.port == 0
+    except ValueError:  # a port that is none, brackets that do not close
+        raise ConfigError("planner.service.base_url is no address") from None
+    if bad:
+        raise ConfigError(f"planner.service.base_url must begin with http:// or https://, found '{base_url}'")
+    if url.username is not None or url.query or url.fragment:  # not shown: it may hold a password
+        raise ConfigError(
+            "planner.service.base_url must hold no user, password or parameters; a key comes from the environment"
+        )
+
+
+def _line(text: str) -> str:
+    """A stranger's text as part of one line that a terminal may show."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))[:200]
 
 
 def _retry_after(value: str | None) -> float:
@@ -288,8 +267,8 @@ def _retry_after(value: str | None) -> float:
     except ValueError:
         try:
             when = parsedate_to_datetime(value)
-        except ValueError:
+            when = when.replace(tzinfo=UTC) if when.tzinfo is None else when
+            seconds = (when - datetime.now(UTC)).total_seconds()
+        except (ValueError, OverflowError, TypeError, IndexError):  # a year of many digits, an offset of days
             return 0.0
-        when = when.replace(tzinfo=UTC) if when.tzinfo is None else when
-        seconds = (when - datetime.now(UTC)).total_seconds()
-    return max(0.0, seconds) if math.isfinite(seconds) else 0.0
+    return 0.0 if math.isnan(seconds) else max(0.0, seconds)

@@ -1,4 +1,4 @@
-"""A scene with food, its frame, and a server on loopback that speaks both services' protocols."""
+"""A scene with food, its frame, and a server on loopback that speaks the services' protocol."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ import torch
 
 from sagemp_cli.config.composition import load_scene
 from sagemp_cli.planners.vlm import VLM
+from sagemp_cli.planners.vlm import request as request_module
+from sagemp_cli.planners.vlm import service as service_module
+from sagemp_cli.planners.vlm.service import ENDPOINTS
 from sagemp_cli.scenes import Frame, Scene, scene_from_mapping
 
 START = torch.tensor([-1.5, -0.2, 0.0], dtype=torch.float64)
@@ -31,16 +34,10 @@ def frame(table) -> Frame:
     return Frame.of(table.workspace)
 
 
-def gemini_reply(text: str) -> dict[str, Any]:
-    return {"candidates": [{"content": {"role": "model", "parts": [{"text": text}]}, "finishReason": "STOP"}]}
-
-
-def openai_reply(text: str) -> dict[str, Any]:
-    message = {"role": "assistant", "content": text, "refusal": None}
+def completion(content: Any) -> dict[str, Any]:
+    """What a service replies when its model says ``content``."""
+    message = {"role": "assistant", "content": content, "refusal": None}
     return {"object": "chat.completion", "choices": [{"index": 0, "message": message, "finish_reason": "stop"}]}
-
-
-REPLIES = {"gemini": gemini_reply, "openai": openai_reply}
 
 
 @dataclass
@@ -111,9 +108,20 @@ def reply() -> type[Reply]:
     return Reply
 
 
-@pytest.fixture(params=["gemini", "openai"])
-def provider(request) -> str:
-    return request.param
+@pytest.fixture
+def provider() -> str:
+    """Which service is asked; a test may parametrize it with the other."""
+    return "openai"
+
+
+@pytest.fixture
+def in_this_process(monkeypatch) -> None:
+    """Requests are made here, not in a process each (half a second): for what has nothing to do with time."""
+
+    def here(request: dict[str, Any], seconds: float) -> dict[str, Any]:
+        return json.loads(json.dumps(request_module.ask(json.loads(json.dumps(request)))))
+
+    monkeypatch.setattr(service_module, "ask_in_process", here)
 
 
 @pytest.fixture
@@ -132,13 +140,13 @@ def ask(server, provider, table, monkeypatch) -> Callable[..., torch.Tensor]:
         attempts: int = 1,
         **service: Any,
     ) -> torch.Tensor:
-        variable = {"gemini": "GEMINI_API_KEY", "openai": "OPENAI_API_KEY"}[provider]
+        variable = ENDPOINTS[provider].key_variable
         if key is None:
             monkeypatch.delenv(variable, raising=False)
         else:
             monkeypatch.setenv(variable, key)
-        server.replies[:] = [r if isinstance(r, Reply) else Reply(body=REPLIES[provider](r)) for r in replies]
-        options = {"base_url": server.url, "image_height": 32, "backoff": 0.01, "timeout": 5.0, "retries": 2} | service
+        server.replies[:] = [r if isinstance(r, Reply) else Reply(body=completion(r)) for r in replies]
+        options = {"base_url": server.url, "image_height": 32, "backoff": 0.01, "timeout": 20.0, "retries": 2} | service
         planner = VLM(
             state_dim=3, horizon=20, dt=0.5, provider=provider, prompt=prompt, attempts=attempts, service=options
         )

@@ -1,4 +1,4 @@
-"""Both services' protocols against a server on loopback: what is sent, and every way in which it can fail."""
+"""Services against a server on loopback: what is sent, what is understood, and every way in which it can fail."""
 
 from __future__ import annotations
 
@@ -9,35 +9,36 @@ import re
 import pytest
 import torch
 
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM, AnswerError, ServiceError
+from sagemp_cli.planners.vlm.service import ENDPOINTS, _retry_after
 
 KEY = "a-secret-key"
 GOOD = '{"waypoints": [[-0.3, -0.3], [0.3, -0.4]]}'
 
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+both = pytest.mark.parametrize("provider", ["gemini", "openai"])
+
+
+@both
 def test_the_prompt_and_the_picture_are_sent_as_the_protocol_says(ask, server, provider):
     ask(GOOD, temperature=0.5, model="some-model")
     (request,) = server.requests
     body = request["body"]
-    if provider == "gemini":
-        assert request["path"] == "/v1beta/models/some-model:generateContent"
-        assert request["headers"]["x-goog-api-key"] == KEY
-        text, image = body["contents"][0]["parts"]
-        text, png = text["text"], image["inline_data"]["data"]
-        assert body["generationConfig"]["temperature"] == 0.5
-    else:
-        assert request["path"] == "/chat/completions" and request["headers"]["authorization"] == f"Bearer {KEY}"
-        assert body["model"] == "some-model" and body["temperature"] == 0.5
-        text, image = body["messages"][0]["content"]
-        text, (head, png) = text["text"], image["image_url"]["url"].split(",")
-        assert head == "data:image/png;base64"
+    assert request["path"] == "/chat/completions" and request["headers"]["authorization"] == f"Bearer {KEY}"
+    assert body["model"] == "some-model" and body["temperature"] == 0.5
+    assert ("seed" in body) == (provider == "openai")  # Gemini refuses requests with one
+    text, image = body["messages"][0]["content"]
+    text, (head, png) = text["text"], image["image_url"]["url"].split(",")
+    assert head == "data:image/png;base64"
     assert "except the burger" in text and "**Start Point (Green Dot):** [-0.75, -0.10]" in text
     assert "**Goal Point (Red Dot):** [0.75, 0.07]" in text
     assert base64.b64decode(png).startswith(b"\x89PNG")
     assert KEY not in json.dumps(body) and KEY not in request["path"]
 
 
+@both
 def test_the_waypoints_become_a_reference_from_the_start_to_the_goals_middle(ask, table):
     (reference,) = ask(GOOD)
     assert reference.shape == (21, 3) and reference.dtype == torch.float64
@@ -73,18 +74,16 @@ def test_prose_and_fences_around_the_answer_change_nothing(ask, wrapped):
 def test_after_an_unusable_answer_the_model_is_asked_again(ask, server):
     ask("no", GOOD, attempts=2)
     assert len(server.requests) == 2
-    seeds = [r["body"].get("seed", r["body"].get("generationConfig", {}).get("seed")) for r in server.requests]
-    assert seeds[0] != seeds[1]
+    assert server.requests[0]["body"]["seed"] != server.requests[1]["body"]["seed"]
 
 
-def test_a_service_that_blocks_the_answer_is_a_refusal(reply, ask, provider):
-    blocked = {
-        "gemini": {"promptFeedback": {"blockReason": "SAFETY"}},
-        "openai": {"choices": [{"message": {"content": None, "refusal": "SAFETY"}}]},
-    }[provider]
-    with pytest.raises(AnswerError, match=re.escape("the model refuses: 'refused by the")) as caught:
-        ask(reply(body=blocked))
-    assert "SAFETY" in str(caught.value)
+@pytest.mark.parametrize(
+    "choice",
+    [{"message": {"content": None, "refusal": "SAFETY"}}, {"message": {}, "finish_reason": "content_filter"}],
+)
+def test_a_service_that_blocks_the_answer_is_a_refusal(reply, ask, choice):
+    with pytest.raises(AnswerError, match=re.escape("the model refuses: 'refused by the")):
+        ask(reply(body={"choices": [choice]}))
 
 
 @pytest.mark.parametrize("status", [429, 500, 503])
@@ -105,6 +104,33 @@ def test_a_wait_beyond_the_time_limit_is_not_begun(reply, ask, server, clock):
     assert len(server.requests) == 1 and clock() < 2
 
 
+@pytest.mark.parametrize(
+    ("value", "seconds"),
+    [
+        (None, 0),
+        ("2.5", 2.5),
+        ("-3", 0),
+        ("nan", 0),
+        ("1e999", float("inf")),
+        ("9" * 5000, float("inf")),
+        ("soon", 0),
+        ("Fri, 31 Dec 999999999999 23:59:59 GMT", 0),
+        ("Fri, 31 Dec 9999 23:59:59 -9999", 0),
+        ("Mon, 01 Jan 2001 00:00:00 GMT", 0),
+        ("Mon, 01 Jan 2001 00:00:00", 0),
+    ],
+)
+def test_retry_after_is_seconds_whatever_stands_there(value, seconds):
+    found = _retry_after(value)
+    assert found == seconds or (str(value).startswith("Fri") and found > 1e9)
+
+
+@pytest.mark.parametrize("value", ["1e999", "9" * 5000, "Fri, 31 Dec 9999 23:59:59 GMT"])
+def test_no_wait_is_longer_than_the_time_limit(reply, ask, value):
+    with pytest.raises(ServiceError, match="the next would come after the time limit of 300 s"):
+        ask(reply(503, "later", {"Retry-After": value}))
+
+
 def test_a_service_that_stays_broken_is_given_up(reply, ask, server, provider):
     broken = reply(500, {"error": {"message": "internal error"}})
     with pytest.raises(ServiceError, match=re.escape(f"{provider}: gave up after 3 requests (500: internal error)")):
@@ -112,25 +138,23 @@ def test_a_service_that_stays_broken_is_given_up(reply, ask, server, provider):
     assert len(server.requests) == 3
 
 
-def test_a_hanging_connection_is_given_up_in_time(reply, ask, provider, clock):
-    with pytest.raises(ServiceError, match=re.escape(f"{provider}: gave up after 2 requests (no reply within 0.2 s)")):
-        ask(reply(after=30.0), timeout=0.2, retries=1)
-    assert clock() < 5
-
-
-def test_a_server_that_is_not_there_is_said(provider, table, monkeypatch):
-    monkeypatch.setenv("GEMINI_API_KEY", KEY)
-    service = {"base_url": "http://127.0.0.1:1", "retries": 1, "backoff": 0.01}
-    planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider, service=service)
+def test_a_server_that_is_not_there_is_said(ask):
     with pytest.raises(ServiceError, match="gave up after 2 requests") as caught:
-        planner.sample(torch.zeros(3), table.goal, scene=table, count=1, generator=torch.Generator())
+        ask(GOOD, base_url="http://127.0.0.1:1", retries=1)
     assert "refused" in str(caught.value).lower()
 
 
+@pytest.mark.parametrize("body", [{"error": {"message": "API key not valid. Please"}}, "API key not valid. Please"])
+def test_a_key_that_is_called_wrong_with_status_400_is_said_to_be(reply, ask, body):
+    with pytest.raises(ServiceError, match="the key in OPENAI_API_KEY is refused"):
+        ask(reply(400, json.dumps([body])))  # Gemini's errors are lists
+
+
 @pytest.mark.parametrize("status", [401, 403])
+@both
 def test_a_wrong_key_is_said_at_once_and_never_shown(reply, ask, server, provider, status):
     said = {"error": {"message": f"Incorrect API key provided: {KEY}"}}
-    variable = {"gemini": "GEMINI_API_KEY", "openai": "OPENAI_API_KEY"}[provider]
+    variable = ENDPOINTS[provider].key_variable
     message = f"{provider}: the key in {variable} is refused ({status}: Incorrect API key provided: <key>)"
     with pytest.raises(ServiceError, match=re.escape(message)) as caught:
         ask(reply(status, said))
@@ -146,14 +170,48 @@ def test_a_request_that_is_wrong_is_not_repeated(reply, ask, server, provider):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ("<html>gateway</html>", "the reply is not JSON, found b'<html>gateway</html>'"),
+        ("<html>gateway</html>", "the reply is not JSON, found '<html>gateway</html>'"),
+        ("", "the reply is not JSON, found ''"),
+        ("[" * 100_000, "the reply is not JSON, found '[[[[["),
+        ("9" * 5000, "the reply is not JSON, found '9999"),
         ("[1]", "the reply is not a JSON object, found list"),
-        ({"surprise": 1}, "the reply is not what the protocol says, found surprise"),
+        ("null", "the reply is not a JSON object, found NoneType"),
+        ({"surprise": 1}, "the reply is not what the protocol says (choices[0].message), found surprise"),
+        ({}, "(choices[0].message), found nothing"),
+        ({"choices": None}, "(choices[0].message), found choices"),
+        ({"choices": []}, "(choices[0].message), found choices"),
+        ({"choices": {"0": 1}}, "(choices[0].message), found choices"),
+        ({"choices": [3]}, "(choices[0].message), found choices"),
+        ({"choices": [{"message": "hello"}]}, "(choices[0].message), found choices"),
+        ({"choices": [{"message": {"content": 5}}]}, "the reply's message.content must be text, found int"),
+        ({"choices": [{"message": {"content": {"text": "a"}}}]}, "message.content must be text, found dict"),
+        ({"choices": [{"message": {"content": ["a"]}}]}, "the reply's message.content must be text, found list"),
+        ({"choices": [{"message": {"content": [{"text": 5}]}}]}, "message.content must be text, found list"),
+        ({"\x1b[31m": "\x1b]0;"}, "(choices[0].message), found ?[31m"),
+        ("\x1b[31mred", "the reply is not JSON, found '?[31mred'"),
+        ('{"choices": [{"message": {"content": "\\ud800 no"}}]}', "the answer holds no JSON object, found '? no'"),
+        ("x" * 2**20 + "x", "the reply is longer than 1048576 bytes"),
     ],
 )
-def test_a_reply_that_is_no_reply_is_said(reply, ask, body, message):
-    with pytest.raises(ServiceError, match=re.escape(message)):
+def test_a_reply_that_is_no_reply_is_said_in_one_line(reply, ask, server, body, message):
+    with pytest.raises((ServiceError, AnswerError), match=re.escape(message)) as caught:
         ask(reply(body=body))
+    said = str(caught.value)
+    assert said.isprintable() and len(said) < 300 and len(server.requests) == 1
+
+
+def test_an_answer_in_parts_is_put_together(reply, ask):
+    parts = [{"type": "text", "text": GOOD[:9]}, {"type": "text", "text": GOOD[9:]}, {"type": "other"}]
+    assert torch.equal(ask(reply(body={"choices": [{"message": {"content": parts}}]})), ask(GOOD))
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Content-Type": "text/html; charset=rot13"}, {"Content-Encoding": "gzip"}, {"Set-Cookie": "a=b"}],
+)
+def test_what_a_reply_says_of_itself_changes_nothing(reply, ask, headers):
+    body = {"choices": [{"message": {"content": GOOD}}]}
+    assert torch.equal(ask(reply(body=body, headers=headers)), ask(GOOD))
 
 
 def test_a_redirect_is_not_followed_with_the_key(reply, ask, server):
@@ -162,8 +220,9 @@ def test_a_redirect_is_not_followed_with_the_key(reply, ask, server):
     assert len(server.requests) == 1
 
 
+@both
 def test_without_a_key_the_public_service_is_not_asked(provider, table, monkeypatch):
-    variable = {"gemini": "GEMINI_API_KEY", "openai": "OPENAI_API_KEY"}[provider]
+    variable = ENDPOINTS[provider].key_variable
     monkeypatch.delenv(variable, raising=False)
     planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider)
     with pytest.raises(ServiceError, match=f"needs a key in the environment variable {variable}"):
@@ -200,7 +259,7 @@ def test_a_damaged_cache_entry_is_named(ask, tmp_path):
     ask(GOOD, cache=str(folder))
     (entry,) = folder.iterdir()
     entry.write_text("{")
-    with pytest.raises(ServiceError, match=re.escape(f"{entry}: is no cached answer; delete it to ask again")):
+    with pytest.raises(UsageError, match=re.escape(f"{entry}: a recording must be JSON")):
         ask(GOOD, cache=str(folder))
 
 
@@ -208,6 +267,16 @@ def test_a_damaged_cache_entry_is_named(ask, tmp_path):
     ("service", "message"),
     [
         ({"base_url": "file:///etc/passwd"}, "planner.service.base_url must begin with http:// or https://"),
+        (
+            {"base_url": "http://user:pw@127.0.0.1"},
+            "planner.service.base_url must hold no user, password or parameters",
+        ),
+        (
+            {"base_url": "http://127.0.0.1/?key=abc"},
+            "planner.service.base_url must hold no user, password or parameters",
+        ),
+        ({"base_url": "http://127.0.0.1:port"}, "planner.service.base_url is no address"),
+        ({"base_url": "http://"}, "planner.service.base_url must begin with http:// or https://"),
         ({"timeout": 0.0}, "timeout and time_limit must be positive seconds"),
         ({"retries": -1}, "retries and temperature must not be negative"),
         ({"modle": "x"}, "planner.service.modle: ServiceOptions has no such option (did you mean 'model'?)"),
