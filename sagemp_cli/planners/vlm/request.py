@@ -37,22 +37,20 @@ def ask_in_process(request: dict[str, Any], seconds: float) -> Outcome | None:
     # -P: the script's own folder is no place to import from. The key goes by the pipe, and no setting of the
     # package's in the environment (another address, a log of requests) counts.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENAI_")}
+    command = [sys.executable, "-P", __file__]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, env=environment, **pipes) as process:
+        try:
+            said, _ = process.communicate(json.dumps(request | {"seconds": seconds}).encode(), timeout=seconds)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:  # also after Ctrl-C
+            process.kill()
+            process.wait()
     try:
-        done = subprocess.run(
-            [sys.executable, "-P", __file__],
-            input=json.dumps(request | {"seconds": seconds}).encode(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            timeout=seconds,
-            env=environment,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return None
-    try:
-        return json.loads(done.stdout)
+        return json.loads(said)
     except ValueError:
-        return {"lost": f"the process that asked ended with code {done.returncode}"}
+        return {"lost": f"the process that asked ended with code {process.returncode}"}
 
 
 def ask(request: dict[str, Any]) -> Outcome:
@@ -128,11 +126,11 @@ def redacted(text: str, key: str) -> str:
 
 def _spellings(c: str) -> str:
     """A pattern for one character, plain or escaped; every repetition in it is bounded, so matching stays linear."""
-    plain = {re.escape(c), re.escape(html.escape(c))}
+    plain = {re.escape(c), re.escape(html.escape(c))} | ({r"\+-"} if c == "+" else set())  # as in UTF-7
     code = f"{ord(c):02x}"
     before = "" if c == "\\" else r"\\{0,4}"
     escaped = [rf"\\{{1,4}}(?:u00|x){code}", rf"%(?:25){{0,3}}{code}", rf"&\#(?:0{{0,4}}{ord(c)}|x0{{0,4}}{ord(c):x});"]
-    return f"(?:{before}(?:{'|'.join(sorted(plain))})|{'|'.join(escaped)})"
+    return f"(?:{before}(?:{'|'.join(sorted(plain, reverse=True))})|{'|'.join(escaped)})"
 
 
 class _TooLong(Exception):

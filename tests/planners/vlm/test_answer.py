@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import time
 
 import pytest
 import torch
@@ -74,6 +75,49 @@ def test_brackets_without_end_are_refused_at_once_whatever_the_recursion_limit()
             waypoints_of("[" * 50_000, FRAME)
     finally:
         sys.setrecursionlimit(limit)
+
+
+def test_brackets_that_only_seem_to_be_closed_are_refused_whatever_the_recursion_limit():
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(200_000)
+    try:
+        with pytest.raises(AnswerError, match="nested too deep"):
+            waypoints_of('["]",' * 19_000, FRAME)
+    finally:
+        sys.setrecursionlimit(limit)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "[" * 99 + "[]," * 33_000,
+        '[" ' * 30 + "[]" * 30_000,
+        '[ "' + '\\"' * 49_000,
+        '{"a":' * 50 + '"\\"' * 30_000,
+        "[}" * 49_000,
+        "[1," * 90 + "1," * 45_000,
+        '{"waypoints": [' + "[0.1,0.2]," * 9_000,
+        '{"waypoints": [' + "[null,0]," * 11_000 + "[0,0]]}",
+        "[" + "9" * 90_000 + "]",
+        '{"waypoints": [[' + "9" * 4_000 + ", 0]]}",
+    ],
+)
+def test_an_answer_made_to_be_slow_is_refused_within_moments(answer):
+    assert len(answer) <= 100_000
+    began = time.perf_counter()
+    with pytest.raises(AnswerError) as caught:
+        waypoints_of(answer, FRAME)
+    assert time.perf_counter() - began < 15  # at most 0.8 s on an idle core
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+
+
+@pytest.mark.parametrize(
+    "answer", ["I cannot \x1b]0;x\x07", '{"\x1b[2J": 1}', '{"waypoints": "\x9b31m\u202e"}', "\ud800"]
+)
+def test_what_a_terminal_would_obey_is_never_in_a_message(answer):
+    with pytest.raises(AnswerError) as caught:
+        waypoints_of(answer, FRAME)
+    assert str(caught.value).isprintable()
 
 
 def test_a_place_in_the_image_but_outside_the_workspace_is_refused():

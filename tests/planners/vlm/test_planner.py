@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 
 import numpy as np
@@ -66,13 +67,37 @@ def _corners(scene):
         ("{", "a recording must be JSON"),
         ('{"answers": []}', 'a recording must hold {"answers": [text, ...]} with at least one text'),
         ('{"answers": [3]}', 'a recording must hold {"answers": [text, ...]} with at least one text'),
+        ("[" * 100_000, "a recording must be JSON"),
+        ("\xff", "a recording must be JSON"),
+        ("[]", "a recording must hold"),
+        ('{"answers": ["a"], "modle": "m"}', "and may hold model, date (2026-11-28) and prompt_hash"),
+        ('{"answers": ["a"], "model": "\\u001b[31m"}', "a recording must hold"),
+        ('{"answers": ["a"], "model": "$\\\\frac$"}', "a recording must hold"),
+        ('{"answers": ["a"], "date": "yesterday"}', "a recording must hold"),
+        ('{"answers": ["a"], "prompt_hash": "0"}', "a recording must hold"),
     ],
 )
 def test_a_recording_that_is_none_is_named(tmp_path, table, content, message):
     path = tmp_path / "answers.json"
-    path.write_text(content)
-    with pytest.raises(UsageError, match=re.escape(f"{path}: {message}")):
+    path.write_text(content, encoding="latin-1")
+    with pytest.raises(UsageError, match=re.escape(f"{path}: ")) as caught:
         draw(VLM(**SIZES, provider="replay", recording=str(path)), table)
+    assert message in str(caught.value) and str(caught.value).isprintable()
+
+
+def test_a_pipe_a_huge_file_and_an_empty_folder_are_no_recordings(tmp_path, table):
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(2**40)
+    (tmp_path / "empty").mkdir()
+    for name, message in (
+        ("pipe", "a recording must be a file of at most"),
+        ("huge", "a recording must be a file of at most"),
+        ("empty", "found 0 recordings (*.json)"),
+        ("missing", "a recording must be a file of at most"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(f"{tmp_path / name}: {message}")):
+            draw(VLM(**SIZES, provider="replay", recording=str(tmp_path / name)), table)
 
 
 @pytest.mark.parametrize(

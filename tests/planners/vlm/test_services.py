@@ -14,6 +14,7 @@ from sagemp_cli.planners.vlm import VLM, AnswerError, ServiceError
 from sagemp_cli.planners.vlm.service import ENDPOINTS, _retry_after
 
 KEY = "a-secret-key"
+START = torch.tensor([-1.5, -0.2, 0.0], dtype=torch.float64)
 GOOD = '{"waypoints": [[-0.3, -0.3], [0.3, -0.4]]}'
 
 
@@ -229,9 +230,51 @@ def test_without_a_key_the_public_service_is_not_asked(provider, table, monkeypa
         planner.sample(torch.zeros(3), table.goal, scene=table, count=1, generator=torch.Generator())
 
 
-def test_a_server_of_ones_own_needs_no_key(ask, server):
-    ask(GOOD, key=None)
+@pytest.mark.parametrize("key", [None, ""])
+def test_a_server_of_ones_own_needs_no_key(ask, server, key):
+    ask(GOOD, key=key)
     assert "authorization" not in server.requests[0]["headers"]
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("sk-12345\n67890", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        ("sk-1234567890\n", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        (" sk-1234567890", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        ("   ", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        ("ключ-1234567", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        ("clé-1234567", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        ("\udcff-1234567", "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks"),
+        (
+            "\x1b[31m-1234567",
+            "the key in OPENAI_API_KEY must be visible ASCII characters without spaces or line breaks",
+        ),
+        ("EMPTY", "the key in OPENAI_API_KEY has 5 characters, at least 8 are needed; unset it for a server that"),
+    ],
+)
+def test_a_key_that_cannot_be_one_is_said_without_it(ask, server, key, message):
+    with pytest.raises(ServiceError, match=re.escape(message)) as caught:
+        ask(GOOD, key=key)
+    assert key.strip() == "" or key not in str(caught.value)
+    assert "12345" not in str(caught.value) and server.requests == []
+
+
+def test_without_the_package_the_extra_is_named(ask, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ServiceError, match="'openai' needs the package openai; install sagemp with its extra 'vlm'"):
+        ask(GOOD)
+
+
+def test_an_answer_that_repeats_the_key_is_neither_kept_nor_shown_with_it(reply, ask, tmp_path):
+    spelled = "".join(f"\\u{ord(c):04x}" for c in KEY)
+    for said in (KEY, spelled, base64.b64encode(KEY.encode()).decode()):
+        folder = tmp_path / str(len(said))
+        with pytest.raises(AnswerError) as caught:
+            ask(f'{{"{said}": 1}}', cache=str(folder))
+        (entry,) = folder.iterdir()
+        assert "<key>" in entry.read_text() and "<key>" in str(caught.value)
+        assert said not in entry.read_text() + str(caught.value) and KEY not in entry.read_text() + str(caught.value)
 
 
 def test_the_cache_answers_again_without_the_service(reply, ask, server, tmp_path):
@@ -242,7 +285,22 @@ def test_the_cache_answers_again_without_the_service(reply, ask, server, tmp_pat
     server.requests.clear()
     again = ask(reply(500), count=2, cache=str(folder), retries=0)
     assert torch.equal(first, again) and not server.requests
-    assert all(KEY not in path.read_text() for path in folder.iterdir())
+    kept = [json.loads(path.read_text()) for path in folder.iterdir()]
+    assert {entry["model"] for entry in kept} == {"gpt-4o"} and all(len(entry["prompt_hash"]) == 64 for entry in kept)
+    assert {entry["answers"][0] for entry in kept} == {GOOD, other}
+
+
+def test_the_cache_can_be_replayed_and_says_who_answered(ask, table, tmp_path):
+    folder = tmp_path / "cache"
+    asked = ask(GOOD, cache=str(folder), model="vendor/model-1")
+    about = {"state_dim": 3, "horizon": 20, "dt": 0.5, "provider": "replay", "recording": str(folder)}
+    replay = VLM(**about, prompt="over_burger")
+    again = replay.sample(START, table.goal, scene=table, count=1, generator=torch.Generator())
+    assert torch.equal(asked, again)
+    assert re.fullmatch(r"VLM planner, replay of cache \(vendor/model-1, \d{4}-\d\d-\d\d\)", replay.label)
+    with pytest.raises(UsageError, match="its answers were given to another prompt than planner.prompt"):
+        other = VLM(**about, prompt="avoid_food")
+        other.sample(START, table.goal, scene=table, count=1, generator=torch.Generator())
 
 
 def test_the_cache_is_not_asked_for_another_seed_model_or_prompt(ask, server, tmp_path):

@@ -105,6 +105,21 @@ def test_repeated_places_and_reversals_give_finite_references(places):
     np.testing.assert_allclose(found[-1, :2], places[-1], atol=1e-9)
 
 
+def test_whatever_waypoints_an_answer_may_hold_the_reference_is_finite_and_no_wider_than_they_are():
+    rng = np.random.default_rng(0)
+    for trial in range(100):
+        count, scale = rng.integers(1, 101), 10.0 ** rng.uniform(-12, 0)
+        places = rng.choice([-1.0, 0.0, 1.0], size=(count, 2)) + scale * rng.normal(size=(count, 2)) * (trial % 3 > 0)
+        places[rng.integers(count, size=count // 2)] = places[0]
+        start = np.array([*places[-1] * (trial % 2), rng.uniform(-7, 7), 0.1])
+        drive = Drive(*10.0 ** rng.uniform(-9, 3, size=3)) if trial % 5 else Drive()
+        found = reference_of(places, start, horizon=50, dt=0.1, drive=drive)
+        assert found.shape == (51, 4) and np.isfinite(found).all()
+        np.testing.assert_array_equal(found[0], start)
+        reach = max(abs(places).max(), abs(start[:2]).max())
+        assert abs(found[:, :2]).max() <= 1.5 * reach + 1e-6
+
+
 def test_wrong_options_are_refused():
     with pytest.raises(ConfigError, match=re.escape("must be zero or positive, found -1, 0.2 and 0.0")):
         Drive(corner_radius=-1)
