@@ -68,7 +68,7 @@ def ask(kind: str, seed: int, *, timeout: float, time_limit: float) -> Trial:
             "image_height": 32,
             "timeout": timeout,
             "time_limit": time_limit,
-            "model": HERE if kind in QUICK and seed % 4 else None,
+            "model": HERE if kind in QUICK and random.Random(seed).random() < 0.75 else None,
             "retries": seed % 2,
             "backoff": 0.01,
             "cache": folder,

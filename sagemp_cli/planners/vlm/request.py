@@ -114,7 +114,9 @@ def redacted(text: str, key: str) -> str:
     """A text with ``<key>`` in place of the key, also where it is escaped as in JSON, URLs or HTML, base64 or hex."""
     if not key:
         return text
-    spelled = r"[\s\x00-\x1f\x7f\u200b-\u200f\u2060\ufeff\ufffd]*".join(_spellings(c) for c in key)
+    spelled = r"[\s\x00-\x1f\x7f\u200b-\u200f\u2060\ufeff\ufffd]*".join(
+        _spellings(c, first=i == 0) for i, c in enumerate(key)
+    )
     raw = key.encode()
     encoded = {raw.hex()}
     for shift in range(3):  # of the key after other bytes, as in "user:key"; only characters that it alone decides
@@ -124,12 +126,13 @@ def redacted(text: str, key: str) -> str:
     return re.sub("|".join([spelled, *map(re.escape, sorted(encoded))]), "<key>", text, flags=re.IGNORECASE)
 
 
-def _spellings(c: str) -> str:
-    """A pattern for one character, plain or escaped; every repetition in it is bounded, so matching stays linear."""
+def _spellings(c: str, *, first: bool) -> str:
+    """A pattern for one character, plain or escaped; repetitions are bounded or begin in one place: it stays linear."""
     plain = {re.escape(c), re.escape(html.escape(c))} | ({r"\+-"} if c == "+" else set())  # as in UTF-7
-    code = f"{ord(c):02x}"
-    before = "" if c == "\\" else r"\\{0,4}"
-    escaped = [rf"\\{{1,4}}(?:u00|x){code}", rf"%(?:25){{0,3}}{code}", rf"&\#(?:0{{0,4}}{ord(c)}|x0{{0,4}}{ord(c):x});"]
+    plain |= {rf"(?:u00|x){ord(c):02x}"}
+    backslashes = r"(?<!\\)\\*" if first else r"\\{0,16}"
+    before = "" if c == "\\" else backslashes
+    escaped = [rf"%(?:25){{0,3}}{ord(c):02x}", rf"&\#(?:0{{0,4}}{ord(c)}|x0{{0,4}}{ord(c):x});"]
     return f"(?:{before}(?:{'|'.join(sorted(plain, reverse=True))})|{'|'.join(escaped)})"
 
 

@@ -50,6 +50,7 @@ SPELLINGS = {
     "HTML numbers": "".join(f"&#x{ord(c):X};" for c in KEY),
     "JSON": json.dumps(KEY)[1:-1],
     "JSON in JSON": json.dumps(json.dumps(KEY))[1:-1],
+    "JSON in JSON in JSON": json.dumps(json.dumps(json.dumps(json.dumps(KEY)))),
     "JSON escapes": "".join(f"\\u{ord(c):04x}" for c in KEY),
     "JSON escapes in JSON": "".join(f"\\\\u{ord(c):04X}" for c in KEY),
     "Python bytes": repr(KEY.encode()),
