@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint reproduce-figures safety-table benchmark campaign clean
+.PHONY: help venv demo check test test-fast lint types reproduce-figures safety-table benchmark campaign clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | \
@@ -35,12 +35,21 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 demo: venv  ## the whole pipeline on the unicycle with reduced data and training: a certificate in minutes
 	$(BIN)/sagemp run experiment=unicycle_node effort=demo
 
+check: lint types test  ## all that continuous integration runs
+
+# Tests share out among the cores; each process has one thread.
 test: venv  ## run the tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses logical --dist worksteal
+
+test-fast: venv  ## the tests of everyday: all but the slow ones
+	$(BIN)/python -m pytest --numprocesses logical --dist worksteal -m 'not slow'
 
 lint: venv  ## check style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: venv  ## check types (pyright's standard mode)
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 # An unknown or falsified verdict (exit codes 5 and 10) has a figure too.
 reproduce-figures: venv  ## make every artifact and figure at full effort
