@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import math
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -33,20 +35,27 @@ PROPAGATORS = {
 }
 """Name to module of this package and class."""
 
+AUTO_CELLS = 64
+"""Cells at most with ``partitions="auto"``."""
+
+_GAIN = 0.02
+"""What doubling the cells must narrow the tube by."""
+
 ROLLOUTS = 12
 """Rollouts that are simulated to compare the step with its recorded program and with the tube."""
 
 
 def reach(
-    step: Callable[[Any, Any], Any] | Loop,
+    step: Callable[..., Any] | Loop,
     start: Box,
-    disturbance: Box,
+    disturbance: Box | None = None,
     horizon: int | None = None,
     *,
     propagator: str | Propagator = "affine",
     partitions: int | str | Sequence[int] = 1,
     batched: bool | None = None,
     cells_at_once: int = 64,
+    per_cell: bool = False,
 ) -> Tube:
     """Tube ``(K+1, n)`` around all rollouts ``x_{k+1} = step(x_k, w_k)`` with ``x_0`` and ``w_k`` in their boxes.
 
@@ -67,12 +76,16 @@ def reach(
             returns the next state in the shape of ``x``. Or a :class:`~sagemp_cli.reachability.propagator.Loop`, whose
             ``step(k, x, w)`` may depend on the step number.
         start: box ``(n,)`` of starts; sides of width zero are allowed.
-        disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n.
+        disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n. None if there are none: the step
+            may then be ``step(x)``, or gets a single 0 as ``w``.
         horizon: number of steps K; of a loop at most its own, and its own by default.
         propagator: one of :data:`PROPAGATORS`, or a propagator itself.
-        partitions: cells of the start box in all, or counts per uncertain dimension (``"2x2"``, ``[2, 2]``).
+        partitions: cells of the start box in all, or counts per uncertain dimension (``"2x2"``, ``[2, 2]``), or
+            ``"auto"``: from one cell on, the count is doubled in the dimension where that narrows the tube most, while
+            it narrows it by 2 % at least, up to :data:`AUTO_CELLS` cells.
         batched: whether the step takes batches; None finds out.
         cells_at_once: most cells in one call of the propagator, which bounds the memory.
+        per_cell: whether to give one tube per cell, ``(C, K+1, n)``; row 0 of each is its cell.
 
     Returns:
         The smallest boxes around the tubes of all cells; row 0 is the start box. Rows are infinite after an overflow.
@@ -83,31 +96,82 @@ def reach(
         UsageError: everything else that is wrong with the arguments or the step.
     """
     _check_box("start", start)
-    _check_box("disturbance", disturbance)
     function, steps, varying = _function(step, start.dim, horizon)
+    if disturbance is None:
+        function, disturbance = _undisturbed(function, step), Box.around([0.0], [0.0])
+    _check_box("disturbance", disturbance)
     chosen = _propagator(propagator)
     if isinstance(cells_at_once, bool) or not isinstance(cells_at_once, int) or cells_at_once < 1:
         raise UsageError(f"cells_at_once must be a positive integer, found {cells_at_once!r}")
-    uncertain = len(uncertain_dimensions(start))
-    counts = parse_partitions(partitions, max(uncertain, 1))
-    if uncertain == 0 and counts != [1]:
-        raise UsageError(f"partitions must be 1 for a start box that is a point, found {partitions!r}")
-    cells = partition(start, counts) if uncertain else Box(start.lower[None], start.upper[None])
-
+    counts = _counts(partitions, start)
     drawn = GlobalRandomness()
     called = probe(function, start, disturbance, batched=batched)
     states, disturbances = _simulated(called, start, disturbance, steps)
     loop = _recorded(called, states, disturbances, steps, varying)
+
+    def tubes_of(cells: Box) -> Tube:
+        chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
+        with torch.no_grad():
+            tubes = [chosen.propagate(loop, Box(low, high), disturbance) for low, high in chunks]
+        return Tube(torch.cat([t.lower for t in tubes]), torch.cat([t.upper for t in tubes]))
+
+    tubes = _adapted(tubes_of, start) if counts is None else tubes_of(_cells(start, counts))
+    cells, tube = Box(tubes.lower[:, 0], tubes.upper[:, 0]), tubes.hull()
     _compare_at_the_start(called, loop, cells, start, disturbance)
-    chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
-    with torch.no_grad():
-        tubes = [chosen.propagate(loop, Box(low, high), disturbance) for low, high in chunks]
-    tube = Tube(torch.cat([t.lower for t in tubes]), torch.cat([t.upper for t in tubes])).hull()
     _compare_on_the_tube(called, loop, tube, disturbance)
     steady(called, states[0, 0], disturbances[0, 0])
     drawn.refuse()
     _check_inside(tube, states)
-    return tube
+    return tubes if per_cell else tube
+
+
+def _counts(partitions: Any, start: Box) -> list[int] | None:
+    """Cells per uncertain dimension; None if they are to be found."""
+    uncertain = len(uncertain_dimensions(start))
+    counts = parse_partitions(partitions, max(uncertain, 1), auto=True)
+    if uncertain == 0 and counts not in ([1], None):
+        raise UsageError(f"partitions must be 1 for a start box that is a point, found {partitions!r}")
+    return [] if uncertain == 0 else counts
+
+
+def _cells(start: Box, counts: Sequence[int]) -> Box:
+    return partition(start, counts) if counts else Box(start.lower[None], start.upper[None])
+
+
+def _adapted(tubes_of: Callable[[Box], Tube], start: Box) -> Tube:
+    """Tubes of as many cells as pay; see :func:`reach`."""
+    counts = [1] * len(uncertain_dimensions(start))
+    tubes = tubes_of(_cells(start, counts))
+    while 2 * math.prod(counts) <= AUTO_CELLS:
+        trials = [[c * (1 + (i == d)) for i, c in enumerate(counts)] for d in range(len(counts))]
+        found = [tubes_of(_cells(start, trial)) for trial in trials]
+        widths = [_log_width(t.hull()) for t in found]
+        best = min(range(len(found)), key=widths.__getitem__)
+        if not widths[best] < _log_width(tubes.hull()) + math.log(1 - _GAIN):
+            break
+        counts, tubes = trials[best], found[best]
+    return tubes
+
+
+def _log_width(tube: Tube) -> float:
+    """Mean over steps after the start and states, of the width's logarithm; huge where it is infinite."""
+    width = torch.nan_to_num(tube.width[1:], nan=1e300, posinf=1e300)
+    return float(width.clamp(1e-300, 1e300).log().mean())
+
+
+def _undisturbed(function: Callable[[int, Any, Any], Any], step: Any) -> Callable[[int, Any, Any], Any]:
+    """The function without disturbance, if its step does not take one."""
+    own = getattr(step, "forward", step) if callable(step) else step.step
+    try:
+        wanted = list(inspect.signature(own).parameters.values())
+    except (TypeError, ValueError):
+        return function
+    positional = [p for p in wanted if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    required = [p for p in positional if p.default is p.empty]
+    several = any(p.kind is p.VAR_POSITIONAL for p in wanted)
+    if several or len(required) > 1 + (not callable(step)):
+        return function
+    return (lambda k, x, w: step(x)) if callable(step) else (lambda k, x, w: step.step(k, x))
 
 
 def _check_box(name: str, box: Any) -> None:
@@ -184,6 +248,8 @@ def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, vary
     """The loop as programs that do, on all simulated states, what the step does."""
     before = step.all(0, states[:, 0], disturbances[:, 0])
     programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
+    if all(programs[0].same_as(other) for other in programs[1:]):
+        programs, varying = programs[:1], False
     reproduced(step, states[:, 0], disturbances[:, 0], before)
     # One comparison for all steps that one program serves.
     at = [slice(k, k + 1) for k in range(steps)] if varying else [slice(0, steps)]

@@ -643,6 +643,64 @@ def test_what_cannot_be_bounded_is_refused_in_one_line_that_names_it(name):
     assert isinstance(caught.value, SagempError) and "\n" not in str(caught.value)
 
 
+def test_without_a_disturbance_the_step_may_take_none():
+    class Loop:
+        horizon, state_dim = 3, 1
+
+        def step(self, k, x):
+            return 0.5 * x
+
+    class Module(nn.Module):
+        def forward(self, x):
+            return 0.5 * x
+
+    start = Box.around([1.0], [0.5])
+    for step in (lambda x: 0.5 * x, lambda x, w: 0.5 * x + w, Loop(), Module(), lambda x, gain=0.5: gain * x):
+        tube = reach(step, start, horizon=3)
+        assert torch.allclose(tube.upper[:, 0], torch.tensor([1.5, 0.75, 0.375, 0.1875], dtype=torch.float64))
+
+
+def test_a_tube_for_every_cell_is_given_on_request():
+    step = RIGHT["unpacked"]
+    tubes = reach(step, START, DISTURBANCE, K, partitions=[2, 1, 2], per_cell=True)
+    assert tubes.lower.shape == (4, K + 1, 3)
+    whole = reach(step, START, DISTURBANCE, K, partitions=[2, 1, 2])
+    assert torch.equal(tubes.hull().lower, whole.lower) and torch.equal(tubes.hull().upper, whole.upper)
+    assert torch.allclose((tubes.upper - tubes.lower)[:, 0].prod(-1).sum(), START.width.prod())
+
+
+def test_cells_are_found_where_they_narrow_the_tube():
+    def step(x, w):  # only the first state's spread costs width
+        return torch.stack([x[..., 0] * x[..., 0] - 0.3, 0.5 * x[..., 1]], -1)
+
+    start = Box.around([0.2, 0.0], [0.4, 0.4])
+    found = reach(step, start, horizon=3, partitions="auto", per_cell=True)
+    cells = found.upper[:, 0] - found.lower[:, 0]
+    assert 2 <= len(cells) <= 64 and bool((cells[:, 1] > 0.79).all()) and bool((cells[:, 0] < 0.5).all())
+    one = reach(step, start, horizon=3)
+    assert bool((found.hull().width <= one.width + 1e-12).all())
+    assert reach(lambda x: 0.5 * x, Box.around([1.0], [0.0]), horizon=2, partitions="auto").horizon == 2
+
+
+@pytest.mark.parametrize("exponent", [1.5, 2.5, -0.5, -1.5, 1 / 3, 0.1, -0.7])
+def test_powers_that_are_not_whole_are_bounded_where_the_base_is_positive(exponent):
+    start = Box.around([1.0, 2.0], [0.3, 0.2])
+    tube = reach(lambda x: 0.5 * x**exponent + 0.5, start, horizon=2, partitions=4)
+    states = [start.sample(500, torch.Generator().manual_seed(1))]
+    for _ in range(2):
+        states.append(0.5 * states[-1] ** exponent + 0.5)
+    states = torch.stack(states, 1)
+    assert bool(tube.contains(states).all()) and bool(tube.bounded)
+    assert bool((tube.width[1] <= 1.5 * (states[:, 1].amax(0) - states[:, 1].amin(0)) + 0.02).all())
+
+
+@pytest.mark.parametrize("function", [torch.argmax, torch.argsort, torch.median, lambda x: x.sort()[0], torch.isnan])
+def test_what_depends_on_the_order_of_entries_is_told_what_to_use_instead(function):
+    with pytest.raises(UnsupportedOperationError, match=r"test_reach\.py, line .*use torch\.(amax|clamp)") as caught:
+        reach(lambda x, w: x + 0.0 * function(x), START, DISTURBANCE, 1)
+    assert "relaxation" not in str(caught.value)
+
+
 READERS = {
     "torch.tensor": lambda x, w: torch.tensor(x) * 0.5,
     "torch.tensor of entries": lambda x, w: torch.tensor([x[0], x[1], x[2]]) * 0.5,

@@ -147,15 +147,19 @@ def square(x: Traced) -> Traced:
 
 @answers("pow", "__pow__", "float_power")
 def power(a: Any, exponent: Any) -> Traced:
-    """Whole powers and the square root."""
+    """Powers with a number as exponent; those that are not whole, of positive values."""
     if type(exponent) is not Traced and is_tensor(exponent) and math.prod(exponent.shape) == 1:
         exponent = exponent.item()
     if not isinstance(a, Traced) or type(exponent) not in (int, float):
         raise UnsupportedOperationError("torch operation 'pow' is supported with a number as exponent")
     if exponent == 0.5:
         return elementwise("sqrt", a)
-    if not math.isfinite(exponent) or exponent != int(exponent):
-        raise UnsupportedOperationError(f"torch operation 'pow' is supported with integers and 0.5, found {exponent}")
+    if not math.isfinite(exponent):
+        raise UnsupportedOperationError(f"torch operation 'pow' is supported with a finite exponent, found {exponent}")
+    if exponent % 1 == 0.5:
+        return multiply(power(a, math.floor(exponent)), elementwise("sqrt", a))
+    if exponent % 1:
+        return elementwise("exp", multiply(elementwise("log", a), exponent))
     if exponent == 1:
         return a._like(a.ids.clone())
     if exponent == 0:

@@ -46,15 +46,20 @@ _TYPES = {
     "int": torch.int32,
     "long": torch.int64,
 }
-_CHOICES = (
-    "allclose eq equal ge greater greater_equal gt heaviside isclose le less less_equal lt ne not_equal sgn sign where"
-)
+_CHOICES = """
+    all allclose any bucketize count_nonzero eq equal ge greater greater_equal gt heaviside isclose isfinite isinf isnan
+    le less less_equal logical_and logical_not logical_or logical_xor lt masked_select ne nonzero not_equal searchsorted
+    sgn sign signbit unique where
+"""
+_PLACES = "argmax argmin argsort argwhere cummax cummin kthvalue median mode msort nanmedian quantile sort topk"
 _NUMBERS = "__bool__ __float__ __index__ __int__ item numpy tolist"
 
 for _word, _type in _TYPES.items():
     ANSWERS[_word] = lambda x, _type=_type: same_type(_type)
 for _word in _CHOICES.split():
     ANSWERS[_word] = lambda *_, _word=_word, **__: _refuse_choice(_word)
+for _word in _PLACES.split():
+    ANSWERS[_word] = lambda *_, _word=_word, **__: _refuse_place(_word)
 for _word in _NUMBERS.split():
     ANSWERS[_word] = lambda x, *_, **__: x._number()
 
@@ -63,4 +68,11 @@ def _refuse_choice(name: str) -> None:
     raise UnsupportedOperationError(
         f"torch operation '{name}' chooses by a value, which on a set is neither True nor False; "
         f"use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+    )
+
+
+def _refuse_place(name: str) -> None:
+    raise UnsupportedOperationError(
+        f"torch operation '{name}' depends on which entry is the larger one, which a set does not say; "
+        f"use torch.amax and torch.amin for the values, or torch.maximum and torch.minimum of neighbours to sort"
     )

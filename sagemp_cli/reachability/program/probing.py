@@ -6,7 +6,9 @@ call (:mod:`sagemp_cli.reachability.program.value`); the calls made here test th
 
 from __future__ import annotations
 
+import contextlib
 import random
+import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -104,7 +106,8 @@ class Step:
 
     def _called(self, k: int, x: Any, w: Any) -> Any:
         try:
-            return self.function(k, x, w)
+            with _eagerly() if isinstance(x, Traced) else contextlib.nullcontext():
+                return self.function(k, x, w)
         except SagempError as error:
             raise type(error)(f"{_line(error)}{error}") from error
         except Exception as error:  # a stranger's code may raise anything
@@ -113,6 +116,11 @@ class Step:
             shapes = f"a state of shape {tuple(x.shape)} and a disturbance of shape {tuple(w.shape)}"
             manner = "on sets" if isinstance(x, Traced) else f"on {shapes}"
             raise kind(f"{_line(error)}step fails {manner} with {type(error).__name__}: {first}") from error
+
+
+def _eagerly() -> Any:
+    """Compiled functions run as they are written, once torch's compiler is there at all: it must not compile us."""
+    return torch.compiler.set_stance("force_eager") if "torch._dynamo" in sys.modules else contextlib.nullcontext()
 
 
 def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box, *, batched: bool | None) -> Step:
