@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,6 +30,7 @@ from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
 from sagemp_cli.reachability.affine.compiled.run import planned_run
 from sagemp_cli.reachability.affine.form import AffineForm, Hints, StepFrame
+from sagemp_cli.reachability.interval.operands import sharper
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.relaxations.band import Band
@@ -136,13 +139,17 @@ class Affine:
         w_center, w_radius = disturbance.center, disturbance.radius
         bands, masks, kept_steps, controls = [], [], [], []
         for k in range(steps):
-            frame = StepFrame(generators, reach, w_radius, hints=None if hints is None else hints[k])
-            x, w = frame.state(center), frame.disturbance(w_center)
-            if watch:
-                after, watched = loop.step_given(loop.given(k), x, w)
+            known = None if hints is None else hints[k]
+            frame = StepFrame(generators, reach, w_radius, hints=known)
+            step = functools.partial(_step, loop, k, watch)
+            after, watched = step(frame.state(center), frame.disturbance(w_center))
+            lost = torch.isfinite(reach).all(-1) & ~torch.isfinite(after.magnitude).all(-1)
+            if bool(lost.any()):  # an operation's domain was left: intervals may know better
+                known = sharper(step, (lowers[-1], uppers[-1]), disturbance, known, where=lost)
+                frame = StepFrame(generators, reach, w_radius, hints=known)
+                after, watched = step(frame.state(center), frame.disturbance(w_center))
+            if watched is not None:
                 controls.append(watched.bounds())
-            else:
-                after = loop.step(k, x, w)
             bands.append(frame.bands)
             center, generators = _advance(after)
             if keep_steps:
@@ -159,6 +166,11 @@ class Affine:
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
         tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
         return AffineRun(tube, bands, masks, kept_steps, controls)
+
+
+def _step(loop: Loop, k: int, watch: bool, x: Any, w: Any) -> tuple[Any, Any]:
+    """The next state, and what the loop gives beside it if that is wanted."""
+    return loop.step_given(loop.given(k), x, w) if watch else (loop.step(k, x, w), None)
 
 
 def _advance(after: AffineForm) -> tuple[Tensor, Tensor]:

@@ -71,6 +71,19 @@ def _outwards(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     return round_down(lower), round_up(upper)
 
 
+def _signed(low: Tensor, high: Tensor, not_negative: Tensor, not_positive: Tensor) -> IntervalForm:
+    """Bounds whose rounding does not cross 0 where the sign is known: there a root or a quotient has its end."""
+    return IntervalForm(
+        torch.where(not_negative, low.clamp(min=0.0), low), torch.where(not_positive, high.clamp(max=0.0), high)
+    )
+
+
+def _signs(a: IntervalForm, b: IntervalForm) -> tuple[Tensor, Tensor]:
+    """Where a product or quotient is not negative, and where it is not positive."""
+    up_a, down_a, up_b, down_b = a.lower >= 0, a.upper <= 0, b.lower >= 0, b.upper <= 0
+    return (up_a & up_b) | (down_a & down_b), (up_a & down_b) | (down_a & up_b)
+
+
 def _interval(value: Any) -> IntervalForm:
     if isinstance(value, IntervalForm):
         return value
@@ -121,7 +134,8 @@ def negate(a: IntervalForm) -> IntervalForm:
 def add(a: Any, b: Any, *, alpha: float = 1) -> IntervalForm:
     """Sum."""
     a, b = _interval(a), _interval(b if alpha == 1 else multiply(b, alpha))
-    return IntervalForm(*_outwards(a.lower + b.lower, a.upper + b.upper))
+    low, high = _outwards(a.lower + b.lower, a.upper + b.upper)
+    return _signed(low, high, (a.lower >= 0) & (b.lower >= 0), (a.upper <= 0) & (b.upper <= 0))
 
 
 @handles(torch.sub, torch.Tensor.sub, torch.Tensor.__sub__)
@@ -143,7 +157,7 @@ def multiply(a: Any, b: Any) -> IntervalForm:
         return torch.square(a)
     a, b = _interval(a), _interval(b)
     corners = torch.stack(torch.broadcast_tensors(*(x * y for x in a.bounds() for y in b.bounds())))
-    return IntervalForm(*_outwards(corners.amin(0), corners.amax(0)))
+    return _signed(*_outwards(corners.amin(0), corners.amax(0)), *_signs(a, b))
 
 
 @handles(torch.div, torch.Tensor.div, torch.true_divide, torch.Tensor.__truediv__)
@@ -152,8 +166,8 @@ def divide(a: Any, b: Any) -> IntervalForm:
     a, b = _interval(a), _interval(b)
     corners = torch.stack(torch.broadcast_tensors(*(x / y for x in a.bounds() for y in b.bounds())))
     pole = (b.lower <= 0) & (b.upper >= 0)
-    low, high = _outwards(corners.amin(0), corners.amax(0))
-    return IntervalForm(torch.where(pole, -math.inf, low), torch.where(pole, math.inf, high))
+    found = _signed(*_outwards(corners.amin(0), corners.amax(0)), *_signs(a, b))
+    return IntervalForm(torch.where(pole, -math.inf, found.lower), torch.where(pole, math.inf, found.upper))
 
 
 @handles(torch.nn.functional.linear)
@@ -165,7 +179,11 @@ def linear(x: IntervalForm, weight: Tensor, bias: Tensor | None = None) -> Inter
     margin = size * ((2 * weight.shape[-1] + 8) * UNIT) + TINY
     low = apply(x.lower, positive, bias) + apply(x.upper, negative)
     high = apply(x.upper, positive, bias) + apply(x.lower, negative)
-    return IntervalForm(low - margin, high + margin)
+    # No term of a sum is negative if the negative ones add up to 0, which is exact then.
+    below = apply(x.lower.clamp(max=0.0), positive) + apply(x.upper.clamp(min=0.0), negative)
+    above = apply(x.upper.clamp(min=0.0), positive) + apply(x.lower.clamp(max=0.0), negative)
+    offset = torch.zeros(weight.shape[0], dtype=weight.dtype) if bias is None else bias
+    return _signed(low - margin, high + margin, (below == 0) & (offset >= 0), (above == 0) & (offset <= 0))
 
 
 @handles(torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__)
@@ -183,7 +201,8 @@ def total(x: IntervalForm, dim: Any = None, keepdim: bool = False) -> IntervalFo
         raise UnsupportedOperationError(f"torch operation 'sum' is supported over one dimension, found dim={dim}")
     size = torch.maximum(x.lower.abs(), x.upper.abs()).sum(dim, keepdim)
     margin = size * ((x.shape[dim] + 4) * UNIT) + TINY
-    return IntervalForm(x.lower.sum(dim, keepdim) - margin, x.upper.sum(dim, keepdim) + margin)
+    low, high = x.lower.sum(dim, keepdim) - margin, x.upper.sum(dim, keepdim) + margin
+    return _signed(low, high, (x.lower >= 0).all(dim, keepdim), (x.upper <= 0).all(dim, keepdim))
 
 
 @handles(torch.maximum, torch.fmax, torch.Tensor.maximum, torch.Tensor.fmax)

@@ -34,4 +34,4 @@ def lines(lower: Tensor, upper: Tensor) -> Lines:
 
 def value_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of ``exp`` on ``[lower, upper]``."""
-    return increasing(torch.exp, lower, upper, ulps=ULPS)
+    return increasing(torch.exp, lower, upper, ulps=ULPS, floor=0.0)

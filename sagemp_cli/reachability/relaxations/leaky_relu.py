@@ -40,10 +40,11 @@ def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Te
     """Bounds on ``[lower, upper]``: monotone for ``s >= 0``; V-shaped for ``s < 0``, least at the kink."""
     leaky = torch.nn.functional.leaky_relu
     if negative_slope >= 0:
-        return increasing(lambda x: leaky(x, negative_slope), lower, upper, ulps=1)
+        low, high = increasing(lambda x: leaky(x, negative_slope), lower, upper, ulps=1)
+        return torch.where(lower >= 0, lower, low if negative_slope else low.clamp(min=0.0)), high
     ends = torch.stack([leaky(lower, negative_slope), leaky(upper, negative_slope)])
     least = torch.where((lower <= 0) & (upper >= 0), torch.zeros_like(lower), ends.amin(0))
-    return outward(least, ends.amax(0), ulps=1)
+    return outward(least, ends.amax(0), ulps=1, floor=0.0)
 
 
 def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None) -> tuple[Tensor, Tensor]:

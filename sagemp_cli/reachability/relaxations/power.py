@@ -42,7 +42,10 @@ def value_range(lower: Tensor, upper: Tensor, exponent: int) -> tuple[Tensor, Te
         most = torch.where(within, torch.full_like(most, math.nan), most)
     elif exponent % 2 == 0:
         least = torch.where(within, torch.zeros_like(least), least)
-    return outward(least, most, ulps=ULPS)
+    low, high = outward(least, most, ulps=ULPS)
+    if exponent % 2 == 0:
+        return low.clamp(min=0.0), high
+    return torch.where(lower >= 0, low.clamp(min=0.0), low), torch.where(upper <= 0, high.clamp(max=0.0), high)
 
 
 def _allowed(lower: Tensor, upper: Tensor, exponent: int) -> Tensor | None:

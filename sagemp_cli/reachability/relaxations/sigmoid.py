@@ -30,4 +30,4 @@ def lines(lower: Tensor, upper: Tensor) -> Lines:
 def value_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of the logistic function on ``[lower, upper]``."""
     low, high = tanh.value_range(0.5 * lower, 0.5 * upper)
-    return (0.5 + 0.5 * low) - 2 * UNIT, (0.5 + 0.5 * high) + 2 * UNIT
+    return ((0.5 + 0.5 * low) - 2 * UNIT).clamp(min=0.0), ((0.5 + 0.5 * high) + 2 * UNIT)

@@ -64,7 +64,7 @@ def value_range(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: floa
     z_lower, z_upper = _scaled(lower, upper, beta)
     low, high = increasing(_value, z_lower, z_upper, ulps=ULPS)
     return (
-        (low - _jump(z_upper, threshold)) / beta - low.abs() / beta * (8 * UNIT) - TINY,
+        ((low - _jump(z_upper, threshold)) / beta - low.abs() / beta * (8 * UNIT) - TINY).clamp(min=0.0),
         high / beta * (1 + 8 * UNIT) + TINY,
     )
 

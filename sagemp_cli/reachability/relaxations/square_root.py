@@ -45,5 +45,5 @@ def lines(lower: Tensor, upper: Tensor) -> Lines:
 
 def value_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of ``sqrt`` on ``[lower, upper]``; nothing is claimed of an interval with negative numbers."""
-    low, high = outward(torch.sqrt(lower), torch.sqrt(upper), ulps=ULPS)
+    low, high = outward(torch.sqrt(lower), torch.sqrt(upper), ulps=ULPS, floor=0.0)
     return low, torch.where(lower >= 0, high, torch.full_like(high, math.inf))

@@ -11,17 +11,19 @@ from torch import Tensor
 from sagemp_cli.sets.rounding import TINY, UNIT
 
 
-def outward(least: Tensor, most: Tensor, *, ulps: float) -> tuple[Tensor, Tensor]:
-    """Computed extremes moved outwards by their error (``ulps`` of 2^-52) and underflow; NaN becomes infinite."""
+def outward(least: Tensor, most: Tensor, *, ulps: float, floor: float = -math.inf) -> tuple[Tensor, Tensor]:
+    """Computed extremes moved outwards by their error (``ulps`` of 2^-52) and underflow; NaN becomes infinite.
+
+    But not below the floor, a bound of all values: the domains of roots and quotients begin at 0 exactly.
+    """
     margin = (2 * ulps + 1) * UNIT
-    return (
-        torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf),
-        torch.nan_to_num(most + (most.abs() * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf),
-    )
+    low = torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
+    high = torch.nan_to_num(most + (most.abs() * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf)
+    return low.clamp(min=floor), high
 
 
 def increasing(
-    value: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, *, ulps: float
+    value: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, **margins: float
 ) -> tuple[Tensor, Tensor]:
-    """Range of an increasing function."""
-    return outward(value(lower), value(upper), ulps=ulps)
+    """Range of an increasing function; margins as for :func:`outward`."""
+    return outward(value(lower), value(upper), **margins)

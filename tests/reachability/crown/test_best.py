@@ -7,7 +7,7 @@ from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.affine.form import Hint
 from sagemp_cli.reachability.crown.best import Best
-from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.crown.crown import Crown, taken_back
 from sagemp_cli.sets import Box
 
 from ..propagator_cases import DISTURBANCE, START, EveryOperation, line, unicycle_loop
@@ -97,3 +97,17 @@ class Fickle:
 def test_bounds_of_another_operation_are_refused():
     with pytest.raises(UsageError, match="does not always do the same operations: exp of 1, where it did sin of 1"):
         Best().propagate(Fickle(), Box.around([0.5], [0.3]), Box.around([0.0], [0.1]))
+
+
+@torch.no_grad()
+def test_bounds_across_a_direction_are_used_across_that_direction():
+    start, w = Box.around([2.485], [1.165]), Box.around([0.0], [0.0])
+    first = Affine().run(Angle(), start, w, keep_steps=True)
+    _, hints = taken_back(first, start, rows=64, inputs=True)
+    kept, anew = (
+        Affine().run(Angle(), start, w, keep_steps=True, hints=[h]).steps[0].frame.relaxations[-1]
+        for h in (hints[0], [h._replace(turn=None) for h in hints[0]])
+    )
+    assert hints[0][-1].name == kept.name == "atan2"
+    assert torch.equal(kept.turn.angle, hints[0][-1].turn.angle) and bool((kept.lower >= hints[0][-1].lower).all())
+    assert float((anew.turn.angle - kept.turn.angle).abs()) > 0.1  # what it would have been

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ from sagemp_cli.reachability.affine.compiled.operations import (
 )
 from sagemp_cli.reachability.affine.compiled.steps import KeptStep, forms_of
 from sagemp_cli.reachability.affine.form import SAFETY, AffineForm, Hints
+from sagemp_cli.reachability.interval.operands import sharper
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.order_reduction import reduce_arrays
@@ -86,7 +88,7 @@ def planned_run(
     plan = _Prepared(loop, steps, batch, n, disturbance)
 
     def in_batch(array: Array) -> Tensor:
-        return torch.from_numpy(array).reshape(*batch, *array.shape[1:])
+        return torch.from_numpy(array).reshape((*batch, *array.shape[1:]))
 
     low, high = (side.reshape(-1, n).numpy() for side in (start.lower, start.upper))
     center, reach = (side.reshape(-1, n).numpy() for side in (start.center, start.radius))
@@ -97,6 +99,12 @@ def planned_run(
         known = None if hints is None else hints[k]
         states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
         after, control = plan.step(k, states)
+        lost = np.isfinite(reach).all(-1) & ~np.isfinite(after.both).all((0, 2))
+        if lost.any():  # an operation's domain was left: intervals may know better
+            box = in_batch(lowers[-1]), in_batch(uppers[-1])
+            known = sharper(plan.step_on_sets(k), box, disturbance, known, where=in_batch(lost))
+            states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
+            after, control = plan.step(k, states)
         found.bands.append([(r.name, Band(*map(in_batch, r.band))) for r in states.records])
         if watch and control is not None:
             found.controls.append(tuple(map(in_batch, states.bounds(control))))
@@ -131,6 +139,7 @@ class _Prepared:
     """A plan with its numbers."""
 
     def __init__(self, loop: FoldableLoop, steps: int, batch: torch.Size, n: int, disturbance: Box) -> None:
+        self._loop = loop
         given = torch.stack([loop.given(k) for k in range(steps)]).to(torch.float64)
         own = given.shape[1 : given.dim() - loop.given_dim]
         shape = given.shape[1 + len(own) :]
@@ -147,6 +156,10 @@ class _Prepared:
         self._pairs = _pairs(plan.nodes)
         self._state = _Fold(plan, plan.state, given, disturbance)
         self._control = None if plan.control is None else _Fold(plan, plan.control, given, disturbance)
+
+    def step_on_sets(self, k: int) -> Callable[[Any, Any], Any]:
+        """The step as it is, on value types."""
+        return lambda x, w: self._loop.step_given(self._loop.given(k), x, w)
 
     def step(self, k: int, states: States) -> tuple[Value, Value | None]:
         """The next state, and the control if the loop has one."""

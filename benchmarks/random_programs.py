@@ -1,0 +1,224 @@
+"""Random closed loops against every native propagator: does a rollout leave its tube?
+
+A program is a tree of operations per next state, the ones among them that are written in several ways (angles, larger
+and smaller ones, clamps, quotients, absolute values) more often than others. Attacked are the corners, a grid, random
+points, and what a local search makes of the worst of them. Run as a script it tries thousands and prints what it found:
+
+    python benchmarks/random_programs.py --count 4000
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.crown.best import Best
+from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.interval.interval import Interval
+from sagemp_cli.sets import Box, Tube
+
+UNARY = {
+    "sin": torch.sin,
+    "cos": torch.cos,
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "exp": lambda x: torch.exp(0.5 * x),
+    "log": lambda x: torch.log(x * x + 0.5),
+    "root": lambda x: torch.sqrt(torch.relu(x)),
+    "length": lambda x: torch.sqrt(x * x + 0.01),
+    "square": torch.square,
+    "cube": lambda x: x**3,
+    "relu": torch.relu,
+    "leaky": lambda x: nn.functional.leaky_relu(x, 0.1),
+    "abs": torch.abs,
+    "clamp": lambda x: torch.clamp(x, -0.4, 0.7),
+    "reciprocal": lambda x: 1.0 / (1.5 + torch.sin(x)),
+    "silu": nn.functional.silu,
+    "softplus": nn.functional.softplus,
+    "atan": torch.atan,
+    "shift": lambda x: 0.7 * x - 0.4,
+    "up": lambda x: x + 1.3,
+}
+BINARY = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / (1.2 + b * b),
+    "share": lambda a, b: torch.exp(a) / (torch.exp(a) + torch.exp(b)),
+    "angle": torch.atan2,
+    "angle away": lambda a, b: torch.atan2(a, 1.2 + b),
+    "angle up": lambda a, b: torch.atan2(1.5 + a, b),
+    "maximum": torch.maximum,
+    "minimum": torch.minimum,
+    "within": lambda a, b: torch.clamp(a, min=-torch.abs(b), max=torch.abs(b)),
+    "norm": lambda a, b: torch.sqrt(a * a + b * b),
+}
+CHOOSING = ("angle", "angle away", "angle up", "maximum", "minimum", "within", "divide", "share")
+
+
+@dataclass(frozen=True)
+class RandomLoop:
+    """``x_{k+1} = shrink * tree(x_k, w_k)`` per state, the same at every step; it can be folded.
+
+    Attributes:
+        trees: one per state: "x0", "x1", ..., "w0", a name with one or two trees.
+    """
+
+    trees: tuple[Any, ...]
+    horizon: int
+    given_dim: ClassVar[int] = 1
+
+    @property
+    def state_dim(self) -> int:
+        return len(self.trees)
+
+    def given(self, k: int) -> Tensor:
+        return torch.zeros(0, dtype=torch.float64)
+
+    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, None]:
+        leaves = {f"x{i}": x[..., i] for i in range(self.state_dim)} | {"w0": w[..., 0]}
+        return 0.8 * torch.stack([_value(tree, leaves) for tree in self.trees], dim=-1), None
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return self.step_given(self.given(k), x, w)[0]
+
+
+@dataclass(frozen=True)
+class OperationByOperation:
+    """The same loop, without what lets it be folded."""
+
+    loop: RandomLoop
+
+    @property
+    def horizon(self) -> int:
+        return self.loop.horizon
+
+    @property
+    def state_dim(self) -> int:
+        return self.loop.state_dim
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return self.loop.step(k, x, w)
+
+
+def _value(tree: Any, leaves: dict[str, Any]) -> Any:
+    if isinstance(tree, str):
+        return leaves[tree]
+    name, *branches = tree
+    return (UNARY.get(name) or BINARY[name])(*(_value(branch, leaves) for branch in branches))
+
+
+def random_problem(seed: int) -> tuple[RandomLoop, Box, Box]:
+    """A loop, a start box ``(n,)`` and a disturbance box ``(1,)``."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def number(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+    def chosen(values: Any) -> Any:
+        return values[int(number(0, len(values) - 1e-9))]
+
+    def tree(depth: int) -> Any:
+        if depth == 0 or number(0, 1) < 0.1:
+            return chosen([f"x{i}" for i in range(states)] * 3 + ["w0"])
+        if number(0, 1) < 0.45:
+            return chosen(list(UNARY)), tree(depth - 1)
+        name = chosen(CHOOSING) if number(0, 1) < 0.6 else chosen(list(BINARY))
+        return name, tree(depth - 1), tree(depth - 1)
+
+    states = chosen([1, 1, 2, 2, 3])
+    loop = RandomLoop(tuple(tree(chosen([2, 3, 4])) for _ in range(states)), chosen([1, 2, 3]))
+    center = [number(-3, 3) for _ in range(states)]
+    radius = [10 ** number(-2.5, 0.3) for _ in range(states)]
+    return loop, Box.around(center, radius), Box.around([number(-0.3, 0.3)], [chosen([0.0, 0.05, 0.3])])
+
+
+@torch.no_grad()
+def worst_rollouts(loop: RandomLoop, start: Box, disturbance: Box, *, count: int = 600, rounds: int = 6) -> Tensor:
+    """Rollouts ``(R, K+1, n)``: corners, random ones, and those that a local search moved outwards."""
+    generator = torch.Generator().manual_seed(0)
+    n, horizon = start.dim, loop.horizon
+
+    def simulated(z: Tensor) -> Tensor:
+        """From points of the unit box of start and disturbances."""
+        x = start.center + start.radius * z[:, :n]
+        w = disturbance.center + disturbance.radius * z[:, n:, None]
+        states = [x]
+        for k in range(horizon):
+            states.append(loop.step(k, states[-1], w[:, k]))
+        return torch.stack(states, dim=1)
+
+    def drawn(rows: int) -> Tensor:
+        return 2 * torch.rand(rows, n + horizon, generator=generator, dtype=torch.float64) - 1
+
+    corners = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=n + horizon)), dtype=torch.float64)
+    z = torch.cat([corners, drawn(count), drawn(count // 2).sign()])
+    found = [simulated(z)]
+    size = 0.5
+    for _ in range(rounds):
+        flat = found[-1][:, 1:].flatten(1)
+        best = torch.cat([flat.nan_to_num(-math.inf).argmax(0), flat.nan_to_num(math.inf).argmin(0)])
+        near = z[best].repeat_interleave(24, 0)
+        z = torch.cat([z[best], (near + size * drawn(len(near))).clamp(-1, 1)])
+        found.append(simulated(z))
+        size *= 0.4
+    return torch.cat(found)
+
+
+def escaped(tube: Tube, states: Tensor) -> float:
+    """How far a rollout lies outside; 0 if none does. Rounding of the simulation is forgiven."""
+    known = torch.isfinite(states).all(-1).all(-1)
+    outside = torch.maximum(tube.lower - states[known], states[known] - tube.upper) - 1e-9 * (1 + states[known].abs())
+    return max(0.0, float(outside.max())) if bool(known.any()) else 0.0
+
+
+PROPAGATORS = {
+    "affine": Affine(),
+    "crown": Crown(),
+    "best": Best(),
+    "best of three": Best(rounds=3),
+    "interval": Interval(),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=4000)
+    parser.add_argument("--first", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    wrong, infinite, needless, begin = Counter(), Counter(), Counter(), time.perf_counter()
+    for seed in range(options.first, options.first + options.count):
+        loop, start, disturbance = random_problem(seed)
+        states = worst_rollouts(loop, start, disturbance)
+        finite = {}
+        folded = seed % 2 == 0
+        for name, propagator in PROPAGATORS.items():
+            tube = propagator.propagate(loop if folded else OperationByOperation(loop), start, disturbance)
+            finite[name] = bool(torch.isfinite(tube.width).all())
+            distance = escaped(tube, states)
+            if distance > 0:
+                wrong[name] += 1
+                print(f"seed {seed}: a rollout leaves the tube of {name} by {distance:.3g}: {loop.trees}", flush=True)
+            infinite[name] += not finite[name]
+        for name in finite:
+            needless[name] += finite["interval"] and not finite[name]
+    print(f"{options.count} programs in {time.perf_counter() - begin:.0f} s, every other one folded")
+    for name in PROPAGATORS:
+        print(
+            f"{name:>14}: {wrong[name]} escapes, {infinite[name]} infinite, "
+            f"of these {needless[name]} where interval arithmetic is finite"
+        )
+
+
+if __name__ == "__main__":
+    main()
