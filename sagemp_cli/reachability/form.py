@@ -111,6 +111,14 @@ class Form:
     def __matmul__(self, other: Any) -> Any:
         return torch.matmul(self, other)
 
+    def _write(self, *_: Any) -> Any:
+        raise UnsupportedOperationError(
+            "a step may not write into a value in place (+=, x[...] = ...): whoever else holds it would keep the old "
+            "set; write x = x + y, torch.stack or torch.cat"
+        )
+
+    __iadd__ = __isub__ = __imul__ = __itruediv__ = __ipow__ = __setitem__ = _write
+
     def __bool__(self) -> bool:
         raise UnsupportedOperationError(
             "a step may not branch on a value: the truth of a set is not one of True and False; "
@@ -140,8 +148,14 @@ class Form:
     @classmethod
     def _dispatch(cls, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         handler = cls.handlers.get(function) or SHARED.get(function)
+        name = getattr(function, "__name__", str(function))
+        if kwargs.get("inplace") or (handler is None and name.endswith("_") and not name.endswith("__")):
+            raise UnsupportedOperationError(
+                f"torch operation '{name}' writes into a value in place: whoever else holds it would keep the old set; "
+                f"use the operation that gives a new value"
+            )
         if handler is None:
-            raise unsupported(getattr(function, "__name__", str(function)))
+            raise unsupported(name)
         return handler(*args, **kwargs)
 
 

@@ -44,7 +44,10 @@ class Recorder:
         self._instructions: list[Instruction] = []
         self._starts: list[int] = []
         self._size = 0
+        # Of every id: the example's number, the instruction that makes it, and whether it is a constant.
         self._table = torch.zeros(0, dtype=torch.float64)
+        self._owner = torch.zeros(0, dtype=torch.int64)
+        self._fixed = torch.zeros(0, dtype=torch.bool)
         self._slots: dict[Any, int] = {}
         self._examples: list[Tensor] = []
         self.constant(torch.zeros(1, dtype=torch.float64))
@@ -67,7 +70,7 @@ class Recorder:
     def constant_entries(self, ids: Tensor) -> Tensor:
         """Which entries do not depend on the inputs."""
         self._check_written(ids)
-        return torch.tensor([i.kind == "constant" for i in self._instructions])[self._owners(ids)]
+        return self._fixed[ids]
 
     def example(self, ids: Tensor) -> Tensor:
         """The numbers of the example, in the shape and strides of the ids; NaN where nothing was written."""
@@ -142,12 +145,17 @@ class Recorder:
         self._starts.append(start)
         self._examples.append(example.detach())
         if self._size > len(self._table):
-            self._table = torch.cat([self._table, self._table.new_zeros(max(self._size - len(self._table), 1024))])
+            more = max(self._size - len(self._table), 1024)
+            self._table, self._owner, self._fixed = (
+                torch.cat([t, t.new_zeros(more)]) for t in (self._table, self._owner, self._fixed)
+            )
         self._table[start : self._size] = example.detach()
+        self._owner[start : self._size] = len(self._instructions) - 1
+        self._fixed[start : self._size] = instruction.kind == "constant"
         return torch.arange(start, self._size)
 
     def _owners(self, ids: Tensor) -> Tensor:
-        return torch.bucketize(ids.contiguous(), torch.tensor(self._starts), right=True) - 1
+        return self._owner[ids]
 
     def _check_written(self, ids: Tensor) -> None:
         if ids.numel() and int(ids.min()) < 0:

@@ -12,8 +12,6 @@ Constants are taken as the exact numbers they are: float32 weights are not round
 from __future__ import annotations
 
 import copy
-import inspect
-import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -319,22 +317,13 @@ def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
     answer = _in_place(name, args) if name.endswith("_") and not name.endswith("__") else _answer_of(function, name)
     # Torch goes first: what it refuses it must refuse before anything is written.
     example = Example(Traced).run(function, args, kwargs)
-    args, kwargs = _out_of_place(function, args, kwargs)
+    kwargs.pop("inplace", None)  # torch's functions hand it over by name
     try:
         return example.settle(answer(*args, **kwargs), name)
     except TypeError as error:
         raise UnsupportedOperationError(
             f"torch operation '{name}' is not supported with these arguments: {error}"
         ) from error
-
-
-def _out_of_place(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The arguments without ``inplace``: what is recorded has no memory to write into."""
-    if any(a is True for a in args) and isinstance(function, types.FunctionType):
-        bound = inspect.signature(function).bind(*args, **kwargs).arguments
-        if "inplace" in bound:
-            args, kwargs = (), dict(bound)
-    return args, {key: value for key, value in kwargs.items() if key != "inplace"}
 
 
 def _answer_of(function: Any, name: str) -> Callable[..., Any]:
