@@ -141,6 +141,16 @@ def test_worst_case_disturbances_reach_the_exact_tube_of_an_affine_loop(library,
     assert bool((tame[:, -1].amax(0) - tame[:, -1].amin(0) < 0.09).all())
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_rollout_a_micrometre_outside_of_its_tube_is_not_inside(side):
+    """The tolerance is for rounding, in units of a nanometre, and for nothing else."""
+    cells, tubes = Box([[0.0]], [[1.0]]), Tube(torch.zeros(1, 2, 1).double(), torch.ones(1, 2, 1).double())
+    face = torch.tensor([0.5 + 0.5 * side], dtype=torch.float64)
+    off = torch.tensor([0.0, 1e-10, 1e-8, 1e-6], dtype=torch.float64)[:, None]
+    states = torch.stack([torch.full_like(off, 0.5), face + side * off], 1)
+    assert inside_tube(states, cells, tubes).tolist() == [True, True, False, False]
+
+
 def test_a_rollout_that_leaves_one_of_its_cells_is_not_inside():
     cells = Box([[0.0], [1.0]], [[1.0], [2.0]])
     tubes = Tube(

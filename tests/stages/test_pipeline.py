@@ -157,3 +157,35 @@ def test_a_wrong_option_is_one_line_and_nothing_is_written(work, stage, override
         stage_named(stage).run(context)
     assert "\n" not in str(caught.value)
     assert list(context.folder.iterdir()) == []
+
+
+def test_executions_start_all_over_the_start_box(toy_folder):
+    artifact = read(toy_folder, "execute")
+    problem, found = problem_of(artifact.header.config), artifact.record
+    starts = np.stack([found.states[found.query == q][:, 0] for q in range(found.query.max() + 1)])
+    assert (starts == starts[:, :1]).all(), "all rollouts of a query start where it was measured"
+    assert len(np.unique(starts[:, 0], axis=0)) == len(starts)
+    uncertain = problem.start.radius.numpy() > 0
+    away = np.abs(starts[:, 0] - problem.start.center.numpy())[:, uncertain] / problem.start.radius.numpy()[uncertain]
+    assert (away <= 1).all() and (away.max(0) > 0.4).all(), "not only near its middle"
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.25, 1.0])
+def test_references_of_a_library_start_in_the_share_of_the_start_box_that_the_config_says(work, monkeypatch, spread):
+    import sagemp_cli.stages.build_library as stage
+
+    context = work("train-planner", "train-tracker", overrides=(f"library.start_spread={spread}",))
+    drawn = []
+
+    def build(draw, *_, **__):
+        drawn.append(draw(64))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stage, "build_library", build)
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(context)
+    start = problem_of(context.config).start
+    away = (drawn[0][:, 0] - start.center).abs()
+    assert bool((away <= spread * start.radius + 1e-12).all())
+    uncertain = start.radius > 0
+    assert bool((away.amax(0)[uncertain] >= 0.9 * spread * start.radius[uncertain]).all())

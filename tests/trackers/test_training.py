@@ -10,6 +10,7 @@ import torch
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.progress import Silent
+from sagemp_cli.sets import Box
 from sagemp_cli.trackers.training import RolloutSampler, train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
 
@@ -58,6 +59,37 @@ def test_the_draw_depends_on_the_generator_alone(references, start, disturbance)
     for a, b in zip(draw(references, start, disturbance), draw(references, start, disturbance), strict=True):
         assert torch.equal(a, b)
     assert not torch.equal(draw(references, start, disturbance)[1], draw(references, start, disturbance, seed=1)[1])
+
+
+def test_the_target_of_a_step_is_the_reference_after_it(unicycle, disturbance, make_tracker):
+    """References that the untrained loop follows exactly, from exact starts without disturbance, cost nothing."""
+    still = unicycle.state_lower.new_tensor([0.0, 0.0, 0.0, 1.0])
+    robot = type(unicycle)(
+        dt=unicycle.dt,
+        control_lower=[-2.0, -2.0],
+        control_upper=[2.0, 2.0],
+        state_lower=(still - 1e-9).tolist(),  # the later starts deviate by a share of the limits' range
+        state_upper=(still + 1e-9).tolist(),
+    )
+    states = [still]
+    for _ in range(12):
+        states.append(robot.step(states[-1], torch.zeros(2), torch.zeros(4)))
+    tracker = make_tracker()
+    with torch.no_grad():
+        for parameter in tracker.layers[-1].parameters():
+            parameter.zero_()  # no control, whatever the errors
+    history = train_tracker(
+        tracker,
+        robot,
+        references=torch.stack(states).expand(2, 13, 4),
+        start=Box.around(still, [0.0] * 4),
+        disturbance=Box.around([0.0] * 4, [0.0] * 4),
+        generator=torch.Generator().manual_seed(0),
+        steps=1,
+        batch=8,
+        rollout_steps=1,  # longer ones, begun late, would run on where the reference stands
+    )
+    assert history.figures["track"][0] < 1e-15
 
 
 def tracking_error(tracker, unicycle, references, start):
