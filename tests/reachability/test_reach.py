@@ -800,6 +800,17 @@ def test_a_propagator_that_lies_is_caught_by_the_rollouts():
         reach(RIGHT["unbound"], START, DISTURBANCE, K, propagator=Liar())
 
 
+def test_a_first_call_imports_no_symbolic_mathematics():
+    # torch.broadcast_shapes does, and with it some thousand modules: as long as torch itself takes.
+    code = (
+        "import sys, torch; from sagemp_cli.reachability import reach; from sagemp_cli.sets import Box; "
+        "step = lambda x, w: torch.stack([x[0] * torch.sin(x[1]), (x @ torch.ones(2).double()).clamp(-1, w[0] + 1)]); "
+        "reach(step, Box.around([0.1, 0.2], [0.1, 0.1]), Box.around([0.0], [0.1]), 2); "
+        "sys.exit('sympy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_importing_the_package_stays_light():
     code = "import sys, sagemp_cli.reachability; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -148,7 +149,7 @@ def _wrapped(handler: Handler) -> Handler:
 
 def _product(a: Any, b: Any) -> OperandForm:
     if isinstance(a, OperandForm) and isinstance(b, OperandForm):
-        a._note("product", torch.broadcast_shapes(a.shape, b.shape))
+        a._note("product", torch.Size(np.broadcast_shapes(a.shape, b.shape)))
     return _wrapped(HANDLERS[torch.mul])(a, b)
 
 
@@ -156,7 +157,7 @@ def _quotient(a: Any, b: Any) -> OperandForm:
     if isinstance(b, OperandForm):
         reciprocal = torch.reciprocal(b)
         if isinstance(a, OperandForm):
-            b._note("product", torch.broadcast_shapes(a.shape, reciprocal.shape))
+            b._note("product", torch.Size(np.broadcast_shapes(a.shape, reciprocal.shape)))
     return _wrapped(HANDLERS[torch.div])(a, b)
 
 

@@ -6,6 +6,7 @@ import math
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -127,7 +128,7 @@ def clamp(x: Any, min: Any = None, max: Any = None) -> Form:  # noqa: A002  (tor
         return x if max is None else torch.minimum(x, _tensor(max))
     low, high = _limit(min, -math.inf), _limit(max, math.inf)
     if isinstance(low, Tensor) or isinstance(high, Tensor):
-        shape = torch.broadcast_shapes(x.shape, *(v.shape for v in (low, high) if isinstance(v, Tensor)))
+        shape = np.broadcast_shapes(x.shape, *(v.shape for v in (low, high) if isinstance(v, Tensor)))
         if shape != x.shape:
             x = x + torch.zeros(shape, dtype=torch.float64)
     return x.relaxed("clamp", _CLAMP, low, high)
