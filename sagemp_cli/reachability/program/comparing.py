@@ -61,6 +61,14 @@ def compare(step: Step, k: int, program: Program, x: Tensor, w: Tensor, after: T
             off = torch.where(loose, ~((after - plain).abs() <= TOLERANCE * (1.0 + after.abs())), off)
     if bool(off.any()):
         row, i = torch.nonzero(off)[0].tolist()
+        if step.rowwise and not step.batched:
+            with torch.no_grad():
+                alone = step.at(k, x[row], w[row])
+            if bool(((alone >= low[row] - slack[row]) & (alone <= high[row] + slack[row])).all()):
+                raise UsageError(
+                    f"step means one thing for a state of shape ({x.shape[-1]},) and another for a batch (at x = "
+                    f"{x[row].tolist()}, w = {w[row].tolist()}); say which is meant with batched=False or batched=True"
+                )
         raise UsageError(
             f"step does not always do the same: at step {k} it differs from what it did when it was recorded (x = "
             f"{x[row].tolist()}, w = {w[row].tolist()}: state {i} becomes {after[row, i].item():.17g}, recorded "

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from torch.nn import functional as F  # noqa: N812
 
-from sagemp_cli.errors import SagempError
+from sagemp_cli.errors import SagempError, UsageError
 from sagemp_cli.reachability import reach
 from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.value import Traced
@@ -275,3 +275,9 @@ def test_a_product_assigned_to_its_name_is_a_new_value():
 
     tube = reach(step, Box.around([1.0, 2.0], [0.1, 0.2]), Box.around([0.0], [0.0]), 1)
     assert torch.allclose(tube.upper[1], torch.tensor([0.55, 1.1], dtype=torch.float64))
+
+
+def test_a_step_whose_batch_means_something_else_in_a_small_part_is_told_to_say_which():
+    step = seen_through(COPIES["to"][0])  # x[0] of a batch is its first row, which shows where the window is only
+    with pytest.raises(UsageError, match="another for a batch .*batched=False or batched=True"):
+        reach(step, Box.around([0.5], [0.5]), None, 1, partitions=2000)
