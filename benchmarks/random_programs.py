@@ -4,7 +4,7 @@ A program is a tree of operations per next state, the ones among them that are w
 and smaller ones, clamps, quotients, absolute values) more often than others. Attacked are the corners, a grid, random
 points, and what a local search makes of the worst of them. Run as a script it tries thousands and prints what it found:
 
-    python benchmarks/random_programs.py --count 4000
+    python benchmarks/random_programs.py --angles 200 --count 4000
 """
 
 from __future__ import annotations
@@ -190,14 +190,55 @@ PROPAGATORS = {
 }
 
 
+@dataclass(frozen=True)
+class Angle:
+    """``x' = atan2(f(x), g(x))``, one step of one state."""
+
+    trees: tuple[Any, Any]
+    horizon: int = 1
+    state_dim: int = 1
+
+    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+        return torch.atan2(*(_value(tree, {"x0": x}) + 0 * x for tree in self.trees)) + 0 * w
+
+
+def angles(count: int, boxes: int = 64) -> None:
+    """Angles of random curves over many intervals each: the direction moves between the passes of ``best``."""
+    generator = torch.Generator().manual_seed(1)
+    names, grid = list(UNARY), torch.linspace(-1, 1, 301, dtype=torch.float64)
+    escapes, bounded, begin = 0, 0, time.perf_counter()
+    for _ in range(count):
+        picks = torch.randint(len(names), (2, 2), generator=generator).tolist()
+        loop = Angle(tuple((names[a], (names[b], "x0")) for a, b in picks))
+        center = 6 * torch.rand(boxes, 1, generator=generator, dtype=torch.float64) - 3
+        radius = 10 ** (2 * torch.rand(boxes, 1, generator=generator, dtype=torch.float64) - 1.7)
+        tube = Best(rounds=3).propagate(loop, Box(center - radius, center + radius), Box.around([0.0], [0.0]))
+        values = loop.step(0, (center + radius * grid)[..., None], torch.zeros(1, dtype=torch.float64))[..., 0]
+        low, high = values.amin(-1) + 1e-12, values.amax(-1) - 1e-12
+        wrong = (low < tube.lower[:, 1, 0] - 1e-9) | (high > tube.upper[:, 1, 0] + 1e-9)
+        escapes += int(wrong.sum())
+        bounded += int((tube.width[:, 1, 0] < 6.28).sum())
+        if bool(wrong.any()):
+            print(f"a rollout leaves the tube of best: {loop.trees}", flush=True)
+    print(
+        f"{count * boxes} angles in {time.perf_counter() - begin:.0f} s: {escapes} escapes, "
+        f"{bounded} bounded by less than the whole circle",
+        flush=True,
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=4000)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--angles", type=int, default=200)
     options = parser.parse_args()
+    angles(options.angles)
     torch.set_num_threads(1)
     wrong, infinite, needless, begin = Counter(), Counter(), Counter(), time.perf_counter()
-    for seed in range(options.first, options.first + options.count):
+    for done, seed in enumerate(range(options.first, options.first + options.count), 1):
+        if done % 100 == 0:
+            print(f"{done} programs, {sum(wrong.values())} escapes", flush=True)
         loop, start, disturbance = random_problem(seed)
         states = worst_rollouts(loop, start, disturbance)
         finite = {}
