@@ -82,12 +82,12 @@ def example() -> Callable[..., Any]:
 
 
 LEARNED_UNICYCLE = {
-    "_target_": "sagemp_cli.dynamics.learned.Learned",
+    "name": "learned",
     "hidden": [4, 4],
     "activation": "tanh",
     "inputs": ["theta", "v"],
     "model": {
-        "_target_": "sagemp_cli.dynamics.unicycle.Unicycle",
+        "name": "unicycle",
         "dt": 0.1,
         "control_lower": [-9.0, -9.0],
         "control_upper": [9.0, 9.0],

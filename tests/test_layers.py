@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent / "sagemp_cli"
 
 LAYERS = (
     ("errors",),
+    ("plugins",),
     ("progress", "workers", "reading"),
     ("config",),
     ("sets", "storage"),

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from sagemp_cli.errors import EXIT_ERROR, EXIT_INTERRUPTED, SagempError
 
 
-class Command(TyperCommand):
-    """A command whose errors reach the user as one line and an exit code of :mod:`sagemp_cli.errors`.
+class _Ending:
+    """Errors reach the user as one line and an exit code of :mod:`sagemp_cli.errors`.
 
     ``SAGEMP_DEBUG=1`` shows the traceback as well.
     """
@@ -23,7 +23,7 @@ class Command(TyperCommand):
     def invoke(self, ctx: typer.Context) -> Any:
         """Run the command and turn whatever it raises into a line and an exit code."""
         try:
-            return super().invoke(ctx)
+            return super().invoke(ctx)  # type: ignore[misc]
         except typer.Exit:
             raise
         except SagempError as e:
@@ -42,6 +42,14 @@ class Command(TyperCommand):
             _complain(f"internal error: {type(e).__name__}: {what} (a bug of sagemp; SAGEMP_DEBUG=1 shows where)")
             code = EXIT_ERROR
         raise typer.Exit(code)
+
+
+class Command(_Ending, TyperCommand):
+    """A command."""
+
+
+class Group(_Ending, TyperGroup):
+    """All commands, with options of their own before them."""
 
 
 def examples(*lines: str) -> str:

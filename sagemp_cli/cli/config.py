@@ -51,14 +51,15 @@ def validate(overrides: Overrides = None) -> None:
 @app.command("list", cls=Command, epilog=examples("sagemp config list", "sagemp config list experiment=unicycle_node"))
 def list_options(overrides: Overrides = None) -> None:
     """List the config groups and their options; the ones in use are marked with a star."""
-    from sagemp_cli.config.composition import chosen_options, groups, options_of, resource_folder
+    from sagemp_cli.config.composition import chosen_options, config_file, groups, options_of
 
     chosen = chosen_options(overrides or [])
     for group in groups():
         typer.echo(group)
         for option in options_of(group):
             mark = "*" if chosen.get(group) == option else " "
-            note = _first_comment(resource_folder("conf") / group / f"{option}.yaml")
+            path = config_file(group, option)
+            note = "a plugin" if path is None else _first_comment(path)
             typer.echo(f"  {mark} {option:<30}{note}".rstrip())
 
 

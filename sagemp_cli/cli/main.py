@@ -23,10 +23,12 @@ from sagemp_cli.cli import (
     train_tracker,
     verify,
 )
-from sagemp_cli.cli.command import Command, examples, flowing
+from sagemp_cli.cli.command import Command, Group, examples, flowing
+from sagemp_cli.cli.completion import PIPELINE
 
 app = typer.Typer(
     name="sagemp",
+    cls=Group,
     rich_markup_mode="rich",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -35,11 +37,12 @@ app = typer.Typer(
         "sagemp run experiment=unicycle_node effort=demo",
         "sagemp verify --partitions 4",
         "sagemp status",
+        "sagemp --plugin my_robot.py run experiment=my_robot",
         "sagemp COMMAND --help",
     ),
 )
 
-_PIPELINE, _AROUND = "The pipeline", "Around it"
+_PIPELINE, _AROUND = PIPELINE, "Around it"
 for _name, _function, _examples, _panel in (
     ("gen-data", gen_data.gen_data, gen_data.EXAMPLES, _PIPELINE),
     ("train-dynamics", train_dynamics.train_dynamics, train_dynamics.EXAMPLES, _PIPELINE),
@@ -70,11 +73,23 @@ def sagemp(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A Python file or module that brings a robot, planner, ... of your own; may be given several times.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Plans from generative models, tracked by a small neural controller, proved safe by reachability.
 
     Every command reads and writes HDF5 files in artifacts/ and takes config overrides as KEY=VALUE.
     """
+    if plugin:
+        from sagemp_cli.plugins.loading import load_all
+
+        load_all(plugin)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from sagemp_cli.cli.completion import complete_override
 from sagemp_cli.errors import UsageError
 
 Overrides = Annotated[
@@ -13,6 +14,7 @@ Overrides = Annotated[
     typer.Argument(
         metavar="KEY=VALUE",
         help="Config overrides, e.g. experiment=unicycle_node planner.hidden=32.",
+        autocompletion=complete_override,
         show_default=False,
     ),
 ]
@@ -59,7 +61,7 @@ def overrides_of(
     overrides = list(given or [])
     for option, key, value in (
         ("--seed", f"{seed_of}.seed".lstrip("."), seed),
-        ("--partitions", "verify.partitions", partitions),
+        ("--partitions", "proof.partitions", partitions),
     ):
         if value is None:
             continue

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sagemp_cli.cli.command import examples, printable
+from sagemp_cli.cli.completion import complete_stage
 from sagemp_cli.cli.options import DryRun, Overrides, Partitions, Seed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import announce, context_of
 from sagemp_cli.cli.time_limit import time_limit as limited
@@ -32,7 +33,13 @@ EXAMPLES = examples(
 def run(
     overrides: Overrides = None,
     until: Annotated[
-        str | None, typer.Option(metavar="STAGE", help="Last stage to run, e.g. verify.", show_default=False)
+        str | None,
+        typer.Option(
+            metavar="STAGE",
+            help="Last stage to run, e.g. verify.",
+            show_default=False,
+            autocompletion=complete_stage,
+        ),
     ] = None,
     partitions: Partitions = None,
     seed: Seed = None,

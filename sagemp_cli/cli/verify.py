@@ -14,7 +14,7 @@ EXAMPLES = examples(
     "sagemp verify",
     "sagemp verify experiment=unicycle_node --partitions 4",
     "sagemp verify --partitions 2x2 propagator=auto_lirpa --overwrite",
-    "sagemp verify --partitions auto verify.budget=100",
+    "sagemp verify --partitions auto proof.budget=100",
     "sagemp verify verify.file=plans.npz executor=processes",
     "sagemp verify --json | jq .verdict",
 )

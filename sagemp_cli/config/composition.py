@@ -14,8 +14,20 @@ from typing import Any
 import yaml
 
 from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.plugins import KINDS
+from sagemp_cli.plugins.project import current_project
+from sagemp_cli.plugins.registry import from_outside
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+_ROOT = "sagemp"
+"""The file that everything begins with; a project's own ``conf/`` has other files, and usually no such one."""
+_DEFAULT_EXPERIMENT = "unicycle_node"
+_OPTIONS = {group: (group,) for group in KINDS} | {
+    "tracker_training": ("tracker_training",),
+    "planner": ("planner", "planner_training"),
+    "dynamics": ("dynamics", "dynamics_training"),
+}
+"""Groups whose options belong to what is picked, with the sections that they are in."""
 
 
 def resource_folder(name: str) -> Path:
@@ -24,48 +36,181 @@ def resource_folder(name: str) -> Path:
     return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
+def config_folders() -> list[Path]:
+    """Where config files are looked for, in order: the project's own ``conf/``, and the package's."""
+    own, brought = current_project().conf, resource_folder("conf")
+    return [brought] if own is None or own.resolve() == brought.resolve() else [own, brought]
+
+
+def config_file(group: str, option: str) -> Path | None:
+    """The file of an option of a config group; None for one that a plugin brings without a file."""
+    found = (folder / group / f"{option}.yaml" for folder in config_folders())
+    return next((path for path in found if path.is_file()), None)
+
+
 def groups() -> list[str]:
     """Names of the config groups, e.g. ``planner``."""
-    return sorted(p.name for p in resource_folder("conf").iterdir() if p.is_dir() and any(p.glob("*.yaml")))
+    every = (p for folder in config_folders() for p in folder.iterdir())
+    return sorted({p.name for p in every if p.is_dir() and any(p.glob("*.yaml"))})
 
 
 def options_of(group: str) -> list[str]:
-    """Names of the options of a config group, e.g. all experiments."""
-    return sorted(p.stem for p in (resource_folder("conf") / group).glob("*.yaml"))
+    """Names of the options of a config group, e.g. all experiments; plugins are options too.
+
+    A file whose name begins with an underscore is what others have in common, and no option.
+    """
+    files = {p.stem for folder in config_folders() for p in (folder / group).glob("*.yaml")}
+    return sorted({name for name in files if not name.startswith("_")} | set(_plugins(group)))
 
 
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     """The resolved config as plain data, with the scene's file read in.
 
     One number given for a list of numbers stands for as many of them as the list has:
-    ``planner.hidden=64`` makes every hidden layer 64 wide.
+    ``planner.hidden=64`` makes every hidden layer 64 wide. Options that an experiment sets for the planner (or tracker,
+    ...) that it picks are for that one: where another one is picked they do not count.
+
+    The plugins of the project in the working directory are loaded first.
 
     Args:
-        overrides: Hydra overrides ``key=value``; ``group=option`` picks an option of a config group.
+        overrides: Hydra overrides ``key=value``; ``group=option`` picks an option of a config group, an
+            ``experiment`` may be the path of a file.
 
     Raises:
         ConfigError: one line that names the override or key, with the nearest known name.
     """
     parsed = [_parse(text) for text in overrides]
-    choices = [o.input_line for o in parsed if _is_group(o.key_or_group)]
+    choices = tuple(_chosen(o) for o in parsed if _is_group(o.key_or_group))
     values = [o for o in parsed if not _is_group(o.key_or_group)]
-    before = _leaves_of(tuple(choices)) if values else {}
+    before = _leaves_of(choices, _surroundings()) if values else {}
     for override in values:
         _check_override(override, before)
-    config = _composed([o.input_line for o in parsed])
+    config = _composed([*choices, *(o.input_line for o in values)])
     for override in values:
         listed, given = before.get(override.key_or_group), override.value()
         if _is_numbers(listed) and _is_number(given):
             _put(config, override.key_or_group, [given] * len(listed))
+    picked = {o.key_or_group: str(o.value()) for o in parsed if _is_group(o.key_or_group)}
+    _set_back_options_of_others(config, picked, [o.key_or_group for o in values])
     config["scene"] = load_scene(config["scene"])
     return config
 
 
 def chosen_options(overrides: Sequence[str] = ()) -> dict[str, str]:
     """Which option of each config group is in use."""
-    for text in overrides:
-        _parse(text)
-    return dict(_hydra(overrides, with_hydra=True).hydra.runtime.choices)
+    parsed = [_parse(text) for text in overrides]
+    lines = [_chosen(o) if _is_group(o.key_or_group) else o.input_line for o in parsed]
+    return dict(_hydra(lines, with_hydra=True).hydra.runtime.choices)
+
+
+def known_keys(overrides: Sequence[str] = ()) -> Mapping[str, Any]:
+    """All dotted keys, with their values, of the config that picks the same options and overrides nothing."""
+    parsed = [_parse(text) for text in overrides]
+    choices = tuple(_chosen(o) for o in parsed if _is_group(o.key_or_group))
+    return _leaves_of(choices, _surroundings())
+
+
+def _plugins(group: str) -> list[str]:
+    """Options that are plugins, which need no config file of their own; those of the project are loaded first."""
+    current_project().load_plugins()
+    return from_outside(group) if group in KINDS else []
+
+
+def _chosen(override: Any) -> str:
+    """A group choice as Hydra gets it; the file of an experiment, and a plugin without one, are made known to it."""
+    from hydra.core.config_store import ConfigStore
+
+    group, option = override.key_or_group, override.value()
+    if group == "experiment" and _is_file(option):
+        option = f"_{Path(option).stem}"
+        ConfigStore.instance().store(group=group, name=option, node=_experiment(override.value()), package="_global_")
+        return f"{group}={option}"
+    return str(override.input_line)
+
+
+def _store_plugins() -> None:
+    """Make plugins known to Hydra as options of their groups; a config file of the same name goes before."""
+    from hydra.core.config_store import ConfigStore
+
+    for group in KINDS:
+        for name in _plugins(group):
+            ConfigStore.instance().store(group=group, name=name, node={"name": name})
+
+
+@functools.cache
+def _search_project_first() -> None:
+    """Make Hydra look into the project's own config folder before the package's."""
+    from hydra.core.config_search_path import ConfigSearchPath
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+    class ProjectFirst(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+            for folder in reversed(config_folders()[:-1]):
+                search_path.prepend(provider="project", path=f"file://{folder}")
+
+    Plugins.instance().register(ProjectFirst)
+
+
+def _experiment(path: str) -> dict[str, Any]:
+    """The content of an experiment's file."""
+    data = _mapping_in(Path(path), f"experiment file {path}")
+    return {"name": Path(path).stem} | data
+
+
+def _set_back_options_of_others(config: dict[str, Any], picked: Mapping[str, str], said: Sequence[str]) -> None:
+    """Where another planner is in use than an experiment picks, take back what the experiment says for its own one.
+
+    An experiment may extend another one, whose options are for what that one picks. Of the groups this holds for, see
+    :data:`_OPTIONS`.
+
+    Args:
+        config: changed in place.
+        picked: options of groups that the command line picks.
+        said: dotted keys that the command line sets itself.
+    """
+    chain = _experiments(picked.get("experiment") or current_project().experiment or _DEFAULT_EXPERIMENT)
+    for group, sections in _OPTIONS.items():
+        now = picked.get(group) or chain[-1][1].get(group)
+        others = [body for body, choices in chain if choices.get(group, now) != now]
+        if now is None or not others:
+            continue
+        own = [body for body, choices in chain if choices.get(group, now) == now]
+        alone = _alone(group, now)
+        for name in sections:
+            usual = alone.get(name) or {}
+            for key, value in [item for body in others for item in (body.get(name) or {}).items()]:
+                kept = any(key in (body.get(name) or {}) for body in own)
+                if kept or any(f"{s}.".startswith(f"{name}.{key}.") for s in said) or config[name].get(key) != value:
+                    continue
+                if key in usual:
+                    config[name][key] = usual[key]
+                else:
+                    del config[name][key]
+
+
+def _experiments(name: str) -> list[tuple[Mapping[str, Any], dict[str, str]]]:
+    """An experiment's file and those that it extends, which come first, each with the options that it picks."""
+    path = Path(name) if _is_file(name) else config_file("experiment", name)
+    if path is None or not path.is_file():
+        return [({}, {})]
+    body, chain, choices = _mapping_in(path, f"experiment file {path}"), [], {}
+    for default in body.get("defaults") or []:
+        if isinstance(default, str) and default != "_self_":
+            chain += _experiments(default)
+            choices |= chain[-1][1]
+        elif isinstance(default, Mapping):
+            choices |= {str(g).removeprefix("override ").lstrip("/"): str(option) for g, option in default.items()}
+    return [*chain, (body, choices)]
+
+
+def _alone(group: str, option: str) -> Mapping[str, Any]:
+    """What an option's file says by itself."""
+    from omegaconf import OmegaConf
+
+    found = OmegaConf.to_container(_hydra([], name=f"{group}/{option}"), resolve=False)
+    assert isinstance(found, dict)
+    return found
 
 
 def _composed(overrides: Sequence[str]) -> dict[str, Any]:
@@ -81,17 +226,24 @@ def _composed(overrides: Sequence[str]) -> dict[str, Any]:
     return config
 
 
-def _hydra(overrides: Sequence[str], *, with_hydra: bool = False) -> Any:
+def _hydra(overrides: Sequence[str], *, with_hydra: bool = False, name: str = _ROOT) -> Any:
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    said = list(overrides)
+    if name == _ROOT:
+        picked = current_project().experiment
+        if picked is not None and not any(o.startswith("experiment=") for o in said):
+            said.insert(0, f"experiment={picked}")
+    _search_project_first()
+    _store_plugins()
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(config_dir=str(resource_folder("conf")), version_base="1.3"):
-            return hydra_compose(config_name="config", overrides=list(overrides), return_hydra_config=with_hydra)
+            return hydra_compose(config_name=name, overrides=said, return_hydra_config=with_hydra)
     except (HydraException, OmegaConfBaseException) as e:
         raise ConfigError(f"config: {_first_line(e)}") from None
 
@@ -112,42 +264,41 @@ def _parse(text: str) -> Any:
     group = override.key_or_group
     if _is_group(group):
         choice, known = override.value(), options_of(group)
-        if choice not in known:
+        if group == "experiment" and _is_file(choice):
+            if not Path(choice).is_file():
+                raise ConfigError(f"experiment={choice}: no such file; known experiments: {', '.join(known)}")
+        elif choice not in known:
             near = did_you_mean(str(choice), known)
             raise ConfigError(f"{group}={choice}: unknown {group}{near}; known: {', '.join(known)}")
     return override
 
 
 def _check_override(override: Any, before: Mapping[str, Any]) -> None:
-    """Complain about an unknown key, or a value of another type than the one it replaces."""
-    key = override.key_or_group
+    """Complain about an unknown key, or one value where a section is."""
+    key, new = override.key_or_group, override.value()
     if override.is_add() or override.is_force_add():
         return
     if key not in before:
         top = sorted({k.partition(".")[0] for k in before})
         near = did_you_mean(key, before)
         raise ConfigError(f"{key}: unknown key{near}" + ("" if near else f"; known at the top: {', '.join(top)}"))
-    if key in _OWN_CHECK:
-        return
-    old, new = before[key], override.value()
-    section = before.get(key.rpartition(".")[0])
-    if isinstance(section, dict) and "_target_" in section:
-        return  # the constructor's signature says what is allowed
-    whole = isinstance(old, int) and not isinstance(old, bool)
-    if whole and (not isinstance(new, int) or isinstance(new, bool)):
-        raise ConfigError(f"{key} must be a whole number (it is {old}), found {new!r}")
-    if isinstance(old, float) and not _is_number(new):
-        raise ConfigError(f"{key} must be a number (it is {old}), found {new!r}")
-    if isinstance(old, dict) and not isinstance(new, dict):
-        raise ConfigError(f"{key} is a section, found {new!r}; its keys: {', '.join(old)}")
-
-
-_OWN_CHECK = ("scene", "verify.partitions", "verify.memory", "verify.budget")
-"""Keys that take values of several types and are checked where they are read."""
+    if isinstance(before[key], dict) and not isinstance(new, dict) and key != "scene":
+        raise ConfigError(f"{key} is a section, found {new!r}; its keys: {', '.join(before[key])}")
 
 
 def _is_group(key: str) -> bool:
-    return (resource_folder("conf") / key).is_dir()
+    return any((folder / key).is_dir() for folder in config_folders())
+
+
+def _is_file(choice: Any) -> bool:
+    return isinstance(choice, str) and choice.endswith((".yaml", ".yml"))
+
+
+def _surroundings() -> tuple[Any, ...]:
+    """What the composition depends on beside the overrides: the project, its files and the plugins."""
+    own = current_project()
+    files = () if own.conf is None else tuple((str(p), p.stat().st_mtime_ns) for p in sorted(own.conf.rglob("*.yaml")))
+    return (own, files, tuple((group, *_plugins(group)) for group in KINDS))
 
 
 def _is_number(value: Any) -> bool:
@@ -159,7 +310,7 @@ def _is_numbers(value: Any) -> bool:
 
 
 @functools.cache
-def _leaves_of(choices: tuple[str, ...]) -> Mapping[str, Any]:
+def _leaves_of(choices: tuple[str, ...], surroundings: tuple[Any, ...]) -> Mapping[str, Any]:
     """All dotted keys, with their values, of the config that picks these options and overrides nothing."""
     return dict(_leaves(_composed(choices)))
 
@@ -184,16 +335,29 @@ def load_scene(scene: Any) -> Any:
     if not isinstance(scene, str):
         return scene
     folder = resource_folder("data") / "scenes"
-    path = folder / f"{scene}.yaml" if "/" not in scene and not scene.endswith((".yaml", ".yml")) else Path(scene)
-    if not path.is_file():
-        known = sorted(p.stem for p in folder.glob("*.yaml"))
-        raise ConfigError(f"scene '{scene}': no such scene{did_you_mean(scene, known)}; known: {', '.join(known)}")
+    if "/" in scene or scene.endswith((".yaml", ".yml")):
+        if not Path(scene).is_file():
+            raise ConfigError(f"scene '{scene}': no such file (looked for {Path(scene).resolve()})")
+        return _mapping_in(Path(scene), f"scene file {scene}")
+    known = sorted(p.stem for p in folder.glob("*.yaml"))
+    if scene not in known:
+        raise ConfigError(
+            f"scene '{scene}': no such scene{did_you_mean(scene, known)}; known: {', '.join(known)}; "
+            f"one of your own is given as a file, scene=path/to/file.yaml"
+        )
+    return _mapping_in(folder / f"{scene}.yaml", f"scene file {scene}")
+
+
+def _mapping_in(path: Path, what: str) -> dict[str, Any]:
+    """The mapping in a YAML file."""
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as e:
+        raise ConfigError(f"{what}: cannot be read ({e.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise ConfigError(f"scene file {path}: not readable as YAML ({_first_line(e)})") from None
+        raise ConfigError(f"{what}: not readable as YAML ({_first_line(e)})") from None
     if not isinstance(data, dict):
-        raise ConfigError(f"scene file {path}: must hold a mapping, found {type(data).__name__}")
+        raise ConfigError(f"{what}: must hold a mapping, found {type(data).__name__}")
     return data
 
 

@@ -7,7 +7,10 @@ only operations for which the propagators have a relaxation (an unknown one is a
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import torch
+from annotated_types import Gt, doc
 from torch import Tensor, nn
 
 from sagemp_cli.errors import ConfigError
@@ -39,12 +42,12 @@ class Dynamics(nn.Module):
     def __init__(
         self,
         *,
-        dt: float,
+        dt: Annotated[float, Gt(0), doc("a positive number of seconds")],
         control_lower: list[float],
         control_upper: list[float],
         state_lower: list[float],
         state_upper: list[float],
-        disturbance: str = "derivative",
+        disturbance: Literal["derivative", "state"] = "derivative",
     ) -> None:
         super().__init__()
         name = type(self).__name__

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.config.binding import build, target_class
+from sagemp_cli.config.ranges import Widths
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError, did_you_mean
 
@@ -35,7 +35,7 @@ class Learned(Dynamics):
     (``load_state_dict``; :mod:`sagemp_cli.identification` makes them) they are NaN, and so is every derivative.
 
     Args:
-        model: config section of the analytical model.
+        model: the analytical model.
         hidden: widths of the hidden layers; the paper has three of 64.
         activation: one of :data:`ACTIVATIONS`; the paper does not say which.
         inputs: names of the states that the network reads, all by default; it reads all controls. The columns of the
@@ -46,15 +46,14 @@ class Learned(Dynamics):
     def __init__(
         self,
         *,
-        model: Mapping[str, Any],
-        hidden: list[int],
-        activation: str = "silu",
+        model: Dynamics,
+        hidden: Widths,
+        activation: Literal["leaky_relu", "silu", "softplus", "tanh"] = "silu",
         inputs: list[str] | None = None,
     ) -> None:
-        kind = target_class(model, "dynamics.model")
-        if not issubclass(kind, Dynamics) or issubclass(kind, Learned):
-            raise ConfigError(f"dynamics.model must be an analytical robot model, found {kind.__name__}")
-        robot: Dynamics = build(model, "dynamics.model")
+        robot = model
+        if isinstance(robot, Learned):
+            raise ConfigError("dynamics.model must be an analytical robot model, found Learned")
         if not hidden or min(hidden) < 1:
             raise ConfigError(f"dynamics.hidden must list positive widths, found {hidden}")
         if activation not in ACTIVATIONS:

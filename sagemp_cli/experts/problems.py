@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 from numpy.typing import NDArray
 
+from sagemp_cli.config.ranges import Count, NonNegative, OrInfinite, Positive
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts.homotopy import guesses
@@ -80,13 +83,13 @@ class Expert:
     scene: Scene
     horizon: int
     weights: Weights
-    margin: float
-    workspace_margin: float = 0.0
-    temperature: float = 0.0
-    longest_detour: float = 1.3
-    optimality: float = 1e-4
-    tolerance: float = 1e-6
-    max_iterations: int = 200
+    margin: NonNegative
+    workspace_margin: NonNegative = 0.0
+    temperature: Annotated[float, Ge(0), OrInfinite()] = 0.0
+    longest_detour: Annotated[float, Ge(1)] = 1.3
+    optimality: Positive = 1e-4
+    tolerance: Positive = 1e-6
+    max_iterations: Count = 200
 
     def __post_init__(self) -> None:
         if not self.temperature >= 0:

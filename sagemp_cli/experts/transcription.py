@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sagemp_cli.config.ranges import NonNegative, Positive
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts.derivatives import row_jacobians
@@ -37,9 +38,9 @@ class Weights:
         rest: controls that cost no effort ``(m,)``, a flying robot's hover thrust; zero when not given.
     """
 
-    effort: Sequence[float]
-    smoothness: Sequence[float]
-    goal: Sequence[float]
+    effort: Sequence[Positive]
+    smoothness: Sequence[NonNegative]
+    goal: Sequence[NonNegative]
     rest: Sequence[float] | None = None
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.config.ranges import Count, Decay, NonNegative, Part, Positive
 from sagemp_cli.dynamics.learned import Layers, Learned, perceptron
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification.enclosure_loss import enclosure_error
@@ -49,10 +50,10 @@ class EnclosureWeight:
         start: share of the training over which the weight grows from 0.
     """
 
-    weight: float = 0.01
-    radius: float = 0.4
-    boxes: int = 16
-    start: float = 0.2
+    weight: NonNegative = 0.01
+    radius: Part = 0.4
+    boxes: Count = 16
+    start: Part = 0.2
 
     def __post_init__(self) -> None:
         if not self.weight >= 0 or not 0 < self.radius <= 1 or self.boxes < 1 or not 0 < self.start <= 1:
@@ -66,13 +67,13 @@ def learn_dynamics(
     robot: Learned,
     *,
     generator: torch.Generator,
-    transitions: int = 2_000_000,
-    held_out: int = 100_000,
-    margin: float = 0.1,
-    steps: int = 12_000,
-    batch: int = 512,
-    learning_rate: float = 5e-3,
-    ema_decay: float | None = 0.995,
+    transitions: Count = 2_000_000,
+    held_out: Count = 100_000,
+    margin: NonNegative = 0.1,
+    steps: Count = 12_000,
+    batch: Count = 512,
+    learning_rate: Positive = 5e-3,
+    ema_decay: Decay | None = 0.995,
     enclosure: EnclosureWeight | None = None,
     checkpoint: Path | None = None,
     identity: str = "",

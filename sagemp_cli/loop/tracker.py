@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.config.ranges import Count, Decay, Widths
 from sagemp_cli.errors import ConfigError
 
 
@@ -30,11 +31,11 @@ class Tracker(nn.Module):
     def __init__(
         self,
         *,
-        state_dim: int,
-        control_dim: int,
-        lookahead: int,
-        hidden: list[int],
-        negative_slope: float = 0.1,
+        state_dim: Count,
+        control_dim: Count,
+        lookahead: Count,
+        hidden: Widths,
+        negative_slope: Decay = 0.1,
         error_scale: list[float] | None = None,
         control_scale: list[float] | None = None,
         control_offset: list[float] | None = None,

@@ -10,13 +10,15 @@ import numpy as np
 import torch
 from torch import nn
 
-from sagemp_cli.config.binding import FROM_DATA, build, parameters_of, target_class
+from sagemp_cli.config.binding import NAME, build, parameters_of, target_class
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.learned import Learned
-from sagemp_cli.errors import ArtifactError
+from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.learning.fit import History
 from sagemp_cli.loop.tracker import Tracker
-from sagemp_cli.planners.base import Planner
+from sagemp_cli.planners.base import StoredPlanner
+from sagemp_cli.planners.own import OwnPlanner
+from sagemp_cli.plugins import KINDS
 from sagemp_cli.storage import Artifact, DynamicsModel, PlannerModel, TrackerModel, TrainingCurve
 
 
@@ -33,16 +35,35 @@ def data_arguments(section: Mapping[str, Any], where: str, dynamics: Dynamics, h
         "control_dim": dynamics.control_dim,
         "horizon": horizon,
         "dt": dynamics.dt,
+        "robot": dynamics,
     }
     wanted = parameters_of(target_class(section, where))
-    return {key: known[key] for key in FROM_DATA if key in wanted}
+    return {key: known[key] for key in KINDS[where].from_data if key in wanted}
 
 
-def planner_from(artifact: Artifact[PlannerModel]) -> Planner:
-    """The trained planner, built from the artifact's own config."""
-    extra = _arguments(artifact.record.arguments, artifact)
-    section = {"_target_": artifact.header.config["planner"].get("_target_")}
-    module = build(section, "planner", **extra)
+def planner_of(section: Mapping[str, Any], dynamics: Dynamics, horizon: int) -> StoredPlanner:
+    """The planner of a config, which has learned nothing yet; of a plain function or object, that in a wrapper."""
+    found = build(section, "planner", **data_arguments(section, "planner", dynamics, horizon))
+    if hasattr(found, "learns_from"):
+        return found
+    return OwnPlanner(found, name=section[NAME], state_names=dynamics.state_names, horizon=horizon)
+
+
+def planner_from(artifact: Artifact[PlannerModel]) -> StoredPlanner:
+    """The trained planner, built from the artifact's own config.
+
+    Raises:
+        ArtifactError: what the file says is no planner.
+    """
+    config = artifact.header.config
+    arguments = _arguments(artifact.record.arguments, artifact)
+    try:
+        if hasattr(target_class(config["planner"], "planner"), "learns_from"):
+            module = build({NAME: config["planner"].get(NAME), **arguments}, "planner")
+        else:
+            module = planner_of(config["planner"], build(config["dynamics"], "dynamics"), config["horizon"])
+    except ConfigError as e:
+        raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)
 
 
@@ -61,8 +82,16 @@ def stand_in(config: Mapping[str, Any]) -> str:
 
 
 def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:
-    """The trained tracker."""
-    module = Tracker(**_arguments(artifact.record.arguments, artifact))
+    """The trained tracker, of the kind that the artifact's config names.
+
+    Raises:
+        ArtifactError: what the file says is no tracker.
+    """
+    arguments = _arguments(artifact.record.arguments, artifact)
+    try:
+        module = build({NAME: artifact.header.config["tracker"].get(NAME), **arguments}, "tracker")
+    except ConfigError as e:
+        raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)
 
 

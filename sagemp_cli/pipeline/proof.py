@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Gt, doc
 from torch import Tensor
 
-from sagemp_cli.config.binding import build
+from sagemp_cli.config.binding import Binding, build
+from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.tracker import Tracker
-from sagemp_cli.pipeline.options import number_complaints
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.sets.partition import parse_partitions, uncertain_dimensions
@@ -21,6 +22,24 @@ from sagemp_cli.verification.executors import Executor
 from sagemp_cli.verification.memory import cells_within, footprint
 from sagemp_cli.verification.problem import Problem
 from sagemp_cli.verification.verification import Verification, require_references, verify_references
+
+
+@dataclass(frozen=True)
+class ProofOptions:
+    """The section ``proof``.
+
+    Attributes:
+        partitions: as :func:`~sagemp_cli.sets.partition.parse_partitions` reads it.
+        budget: cells of one reference at most, with ``partitions: auto``.
+        memory: of the results and of what is propagated at a time.
+    """
+
+    partitions: Any
+    budget: Count
+    memory: Annotated[float, Gt(0), doc("a positive number of GiB")]
+
+
+SECTION = Binding("proof", ProofOptions)
 
 
 @dataclass(frozen=True)
@@ -45,22 +64,19 @@ class Proof:
 
     @classmethod
     def of(cls, config: Mapping[str, Any], problem: Problem) -> Proof:
-        """From sections ``verify``, ``propagator`` and ``executor``.
+        """From sections ``proof``, ``propagator`` and ``executor``.
 
         Raises:
             ConfigError: a value that is not allowed.
         """
-        section = config["verify"]
-        complaints = partition_complaints(section, len(uncertain_dimensions(problem.start)))
-        if complaints:
-            raise ConfigError("; ".join(complaints))
+        options: ProofOptions = SECTION.made(config)
         return cls(
             problem=problem,
             propagator=build(config["propagator"], "propagator"),
             executor=build(config["executor"], "executor"),
-            counts=parse_partitions(section["partitions"], len(uncertain_dimensions(problem.start)), auto=True),
-            budget=section["budget"],
-            memory=float(section["memory"]),
+            counts=counts_of(options.partitions, problem, "proof"),
+            budget=options.budget,
+            memory=options.memory,
         )
 
     def verify(
@@ -102,15 +118,13 @@ class Proof:
         return references * (self.budget + trials)
 
 
-def partition_complaints(section: Mapping[str, Any], uncertain: int) -> list[str]:
-    """What is wrong with ``partitions``, ``budget`` and ``memory`` of the section ``verify``."""
-    found = []
+def counts_of(partitions: Any, problem: Problem, where: str) -> list[int] | None:
+    """Cells per uncertain dimension of a problem, None for an adaptive partition; ``where`` names the section.
+
+    Raises:
+        ConfigError: what is no partition of it.
+    """
     try:
-        parse_partitions(section["partitions"], uncertain, auto=True)
+        return parse_partitions(partitions, len(uncertain_dimensions(problem.start)), auto=True)
     except ConfigError as e:
-        found.append(f"verify.{e}")
-    found += number_complaints(section, "verify", budget=1)
-    memory = section["memory"]
-    if not isinstance(memory, int | float) or isinstance(memory, bool) or not 0 < memory < float("inf"):
-        found.append(f"verify.memory must be a positive number of GiB, found {memory!r}")
-    return found
+        raise ConfigError(f"{where}.{e}") from None

@@ -3,17 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
-from sagemp_cli.config.binding import all_complaints, build
+from sagemp_cli.config.binding import build, option_complaints, section_complaints
 from sagemp_cli.config.composition import options_of
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
 from sagemp_cli.pipeline.context import named_run_file
-from sagemp_cli.pipeline.options import key_complaints
 from sagemp_cli.pipeline.problem import problem_of
-from sagemp_cli.pipeline.proof import partition_complaints
+from sagemp_cli.pipeline.proof import SECTION, counts_of
 from sagemp_cli.pipeline.stage import STAGES
-from sagemp_cli.sets.partition import uncertain_dimensions
+from sagemp_cli.plugins import KINDS
+
+Section = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The section ``effort``: a word, and what it adds to the names of folders."""
+
+    name: str
+    suffix: str
+
+
+@dataclass(frozen=True)
+class Centered:
+    """The section ``start``; the problem checks the numbers, which belong to the robot's states."""
+
+    center: Any
+    radius: Any
+
+
+@dataclass(frozen=True)
+class Radius:
+    """The section ``disturbance``."""
+
+    radius: Any
+
+
+@dataclass(frozen=True)
+class Config:
+    """The keys at the top, and which of them are sections; what is in these is said where it is read."""
+
+    name: str
+    artifacts: str
+    sources: Section
+    seed: Whole
+    horizon: Count
+    scene: Section
+    start: Centered
+    disturbance: Radius
+    effort: Effort
+    dynamics: Section
+    expert: Section
+    planner: Section
+    tracker: Section
+    tracker_training: Section
+    propagator: Section
+    executor: Section
+    proof: Section
+    verify: Section
+    library: Section
+    execute: Section
+    safety: Section
+    dynamics_training: Section | None = None
+    planner_training: Section | None = None
+
+
+_SECTIONS = tuple(f.name for f in fields(Config) if f.type not in ("str", "Whole", "Count") and "None" not in f.type)
 
 
 def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> None:
@@ -26,10 +84,18 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
     Raises:
         ConfigError: one line with every complaint.
     """
-    found = all_complaints(config) + [complaint for stage in STAGES for complaint in stage.complaints(config)]
+    found = option_complaints(Config, config, "")
+    if not all(isinstance(config.get(name), Mapping) for name in _SECTIONS):
+        raise ConfigError("; ".join(found))
+    for section in KINDS:
+        found += section_complaints(config[section], section)
+    found += SECTION.complaints(config)
+    for stage in STAGES:
+        try:
+            found += stage.complaints(config)
+        except ConfigError as e:  # a name that nobody knows, which is among the complaints already
+            found.append(str(e))
     found += _source_complaints(config)
-    found += key_complaints(config["start"], "start", ("center", "radius"))
-    found += key_complaints(config["disturbance"], "disturbance", ("radius",))
     if problem and not any(complaint.startswith("dynamics") for complaint in found):
         found += _problem_complaints(config)
     if found:
@@ -40,9 +106,6 @@ def _source_complaints(config: Mapping[str, Any]) -> Iterator[str]:
     sources, own = config["sources"], str(config["name"])
     shared = [stage.name for stage in STAGES if any(stage.name in other.inputs for other in STAGES)]
     experiments = options_of("experiment")
-    if not isinstance(sources, Mapping):
-        yield f"sources must be a mapping of stages to experiments, found {sources!r}"
-        return
     for stage, experiment in sources.items():
         if stage not in shared:
             near = did_you_mean(str(stage), shared) or f"; allowed: {', '.join(shared)}"
@@ -63,9 +126,13 @@ def _problem_complaints(config: Mapping[str, Any]) -> list[str]:
         problem = problem_of(config)
     except UsageError as e:
         return [str(e)]
-    found = partition_complaints(config["verify"], len(uncertain_dimensions(problem.start)))
-    try:
-        build(config["executor"], "executor")
-    except ConfigError as e:
-        found.append(str(e))
+    found = []
+    for check in (
+        lambda: counts_of(config["proof"].get("partitions"), problem, "proof"),
+        lambda: build(config["executor"], "executor"),
+    ):
+        try:
+            check()
+        except ConfigError as e:
+            found.append(str(e))
     return found

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sagemp_cli.config.binding import target_class
+from sagemp_cli.config.binding import Binding, target_class
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.storage import (
@@ -119,9 +119,16 @@ class Stage:
                 f"make it with '{owner.command(self.name)}'"
             )
 
+    def bindings(self, config: Mapping[str, Any]) -> tuple[Binding, ...]:
+        """The sections that this stage reads and what takes them, beside those that pick a thing by name."""
+        found = getattr(self._module, "SECTIONS", None)
+        return self._module.sections(config) if found is None else found
+
     def complaints(self, config: Mapping[str, Any]) -> list[str]:
-        """What is wrong with the sections that this stage reads and no class is built from, one line each."""
-        return self._module.complaints(config)
+        """What is wrong with these sections, one line each."""
+        if not self.applies(config):
+            return []
+        return [complaint for binding in self.bindings(config) for complaint in binding.complaints(config)]
 
     @property
     def _module(self) -> ModuleType:
@@ -145,8 +152,6 @@ def _references_file(config: Mapping[str, Any]) -> str:
 
 
 _ROBOT = ("name", "dynamics", "scene", "horizon")
-# Memory decides which cells are propagated together, which changes the last bits of their tubes.
-_PARTITION = ("verify.partitions", "verify.budget", "verify.memory")
 
 STAGES = (
     Stage(
@@ -172,14 +177,14 @@ STAGES = (
         "tracker.h5",
         TrackerModel,
         ("train-dynamics", "train-planner"),
-        (*_ROBOT, "tracker", "training", "start", "disturbance", "seed"),
+        (*_ROBOT, "tracker", "tracker_training", "start", "disturbance", "seed"),
     ),
     Stage(
         "verify",
         "certificate.h5",
         Certificate,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", "verify", "start", "disturbance"),
+        (*_ROBOT, "propagator", "proof", "verify", "start", "disturbance"),
         variant=_references_file,
         seed="verify.seed",
     ),
@@ -188,7 +193,7 @@ STAGES = (
         "library.h5",
         Library,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", *_PARTITION, "library", "start", "disturbance"),
+        (*_ROBOT, "propagator", "proof", "library", "start", "disturbance"),
         seed="library.seed",
     ),
     Stage(
@@ -204,7 +209,7 @@ STAGES = (
         "safety.h5",
         SafetyRates,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", *_PARTITION, "library.start_spread", "safety", "start", "disturbance"),
+        (*_ROBOT, "propagator", "proof", "library.start_spread", "safety", "start", "disturbance"),
         seed="safety.seed",
     ),
 )

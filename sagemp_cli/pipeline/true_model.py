@@ -9,14 +9,12 @@ from typing import Any
 
 from torch import Tensor
 
-from sagemp_cli.config.binding import options_for
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.config.binding import Binding
 from sagemp_cli.loop.tracker import Tracker
-from sagemp_cli.pipeline.proof import Proof
+from sagemp_cli.pipeline.proof import Proof, counts_of
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.sets.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.storage import TrueModel
 from sagemp_cli.verification.deviation import Folded, split
 
@@ -32,20 +30,14 @@ class TrueModelProof:
     proof: Proof
 
     @classmethod
-    def of(cls, section: Any, proof: Proof) -> TrueModelProof:
+    def of(cls, config: Mapping[str, Any], proof: Proof) -> TrueModelProof:
         """From the section ``verify.true_model`` and the proof of the learned robot itself.
 
         Raises:
             ConfigError: an option or a partition that is not one.
         """
-        counts = proof.counts
-        options: Mapping[str, Any] = options_for(_options, section, "verify.true_model")
-        if options.get("partitions") is not None:
-            try:
-                uncertain = len(uncertain_dimensions(proof.problem.start))
-                counts = parse_partitions(options["partitions"], uncertain, auto=True)
-            except ConfigError as e:
-                raise ConfigError(f"verify.true_model.{e}") from None
+        partitions = SECTION.options(config).get("partitions")
+        counts = proof.counts if partitions is None else counts_of(partitions, proof.problem, SECTION.where)
         affine = proof.propagator if isinstance(proof.propagator, Affine) else Affine()
         return cls(dataclasses.replace(proof, propagator=Folded(affine), counts=counts))
 
@@ -57,4 +49,7 @@ class TrueModelProof:
 
 
 def _options(*, partitions: Any = None) -> None:
-    """The options of the section: cells as ``verify.partitions`` has them, which is also the default."""
+    """The options of the section: cells as ``proof.partitions`` has them, which is also the default."""
+
+
+SECTION = Binding("verify.true_model", _options)

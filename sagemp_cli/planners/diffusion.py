@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
+from sagemp_cli.config.ranges import Count, Share
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.planners.generative import Conditions, GenerativeLoss, GenerativePlanner
 
@@ -65,11 +66,11 @@ class Diffusion(GenerativePlanner):
     def __init__(
         self,
         *,
-        levels: int = 100,
-        prediction: str = "knots",
-        sampler: str = "ddim",
-        denoising_steps: int = 20,
-        eta: float = 0.0,
+        levels: Count = 100,
+        prediction: Literal["knots", "v", "epsilon"] = "knots",
+        sampler: Literal["ddpm", "ddim"] = "ddim",
+        denoising_steps: Count = 20,
+        eta: Share = 0.0,
         **common: Any,
     ) -> None:
         super().__init__(**common)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
+from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.planners.generative import Conditions, GenerativeLoss, GenerativePlanner
 
@@ -66,7 +67,13 @@ class FlowMatching(GenerativePlanner):
 
     loss_type: ClassVar = FlowMatchingLoss
 
-    def __init__(self, *, method: str = "midpoint", integration_steps: int = 10, **common: Any) -> None:
+    def __init__(
+        self,
+        *,
+        method: Literal["euler", "midpoint", "heun", "rk4"] = "midpoint",
+        integration_steps: Count = 10,
+        **common: Any,
+    ) -> None:
         super().__init__(**common)
         if method not in STAGES:
             raise ConfigError(f"planner: method must be one of {tuple(STAGES)}, found '{method}'")

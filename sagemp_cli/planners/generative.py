@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.errors import ConfigError, NonFiniteError
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.normalizer import Normalizer
@@ -70,12 +71,12 @@ class GenerativePlanner(nn.Module, ABC):
     def __init__(
         self,
         *,
-        state_dim: int,
-        horizon: int,
-        knots: int = 20,
-        width: int = 64,
-        kernel: int = 3,
-        frequencies: int = 8,
+        state_dim: Count,
+        horizon: Count,
+        knots: Count = 20,
+        width: Count = 64,
+        kernel: Count = 3,
+        frequencies: Whole = 8,
     ) -> None:
         super().__init__()
         if state_dim < 1 or horizon < 1:
@@ -192,7 +193,7 @@ class GenerativeLoss(ABC):
     """
 
     def __init__(
-        self, planner: GenerativePlanner, demonstrations: Tensor, *, steps: int, batch_size: int = 128
+        self, planner: GenerativePlanner, demonstrations: Tensor, *, steps: Count, batch_size: Count = 128
     ) -> None:
         if batch_size < 1:
             raise ConfigError(f"planner loss: batch_size must be positive, found {batch_size}")

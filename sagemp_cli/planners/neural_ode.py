@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.config.ranges import Count, NonNegative, Positive, Share, Whole, Widths
 from sagemp_cli.errors import ConfigError, NonFiniteError
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.networks import TimeMLP
@@ -49,14 +50,14 @@ class NeuralODELoss:
         planner: NeuralODE,
         demonstrations: Tensor,
         *,
-        steps: int,
-        batch_size: int = 64,
-        points: int = 1024,
-        derivative_share: float = 0.7,
-        first_window: int = 25,
-        spread: float = 0.05,
-        pull: float = 10.0,
-        hold: float = 0.1,
+        steps: Count,
+        batch_size: Count = 64,
+        points: Count = 1024,
+        derivative_share: Share = 0.7,
+        first_window: Count = 25,
+        spread: NonNegative = 0.05,
+        pull: NonNegative = 10.0,
+        hold: NonNegative = 0.1,
     ) -> None:
         if not 0 <= derivative_share <= 1 or min(batch_size, points, first_window) < 1 or min(spread, pull, hold) < 0:
             raise ConfigError(
@@ -133,15 +134,15 @@ class NeuralODE(nn.Module):
     def __init__(
         self,
         *,
-        state_dim: int,
-        horizon: int,
-        dt: float,
-        hidden: list[int],
-        frequencies: int = 3,
-        method: str = "euler",
-        substeps: int = 1,
-        noise: float | Sequence[float] = 0.0,
-        noise_time: float = 1.0,
+        state_dim: Count,
+        horizon: Count,
+        dt: Positive,
+        hidden: Widths,
+        frequencies: Whole = 3,
+        method: Literal["euler", "rk4"] = "euler",
+        substeps: Count = 1,
+        noise: NonNegative | Sequence[NonNegative] = 0.0,
+        noise_time: Positive = 1.0,
     ) -> None:
         super().__init__()
         if state_dim < 1 or horizon < 1 or substeps < 1:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sagemp_cli.config.ranges import Count, Decay, Positive
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.planners.base import LearnedPlanner
@@ -32,9 +33,9 @@ def train_planner(
     scene: Scene,
     position: tuple[int, ...],
     generator: torch.Generator,
-    steps: int,
-    learning_rate: float = 1e-2,
-    ema_decay: float | None = 0.995,
+    steps: Count,
+    learning_rate: Positive = 1e-2,
+    ema_decay: Decay | None = 0.995,
     loss: Mapping[str, Any] | None = None,
     checkpoint: Path | None = None,
     identity: str = "",

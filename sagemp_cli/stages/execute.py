@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from sagemp_cli.config.binding import Binding
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.execution import execute_queries
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import planner_from, tracker_from
-from sagemp_cli.pipeline.options import key_complaints, number_complaints
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.pipeline.tubes import verification_of
 from sagemp_cli.report.figure import draw_beside
@@ -17,9 +17,27 @@ from sagemp_cli.report.rollouts import draw_rollouts
 from sagemp_cli.storage import Rollouts
 
 
+@dataclass(frozen=True)
+class Options:
+    """The section ``execute``.
+
+    Attributes:
+        queries: starts measured in X_I.
+        rollouts: disturbance sequences per query.
+        seed: of what is sampled.
+    """
+
+    queries: Count
+    rollouts: Count
+    seed: Whole
+
+
+SECTIONS = (Binding("execute", Options),)
+
+
 def run(context: StageContext) -> Path:
     """Measure starts in X_I, ask the planner, track the closest certified reference, and watch the tube."""
-    (problem, robot_files), section = trained_problem(context), context.config["execute"]
+    (problem, robot_files), section = trained_problem(context), SECTIONS[0].made(context.config)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     library_file = context.read("build-library")
     planner, tracker = planner_from(planner_file), tracker_from(tracker_file)
@@ -32,8 +50,8 @@ def run(context: StageContext) -> Path:
         dynamics=problem.dynamics,
         tracker=tracker,
         scene=problem.scene,
-        starts=problem.start.sample(section["queries"], context.generator("execute: starts")),
-        rollouts=section["rollouts"],
+        starts=problem.start.sample(section.queries, context.generator("execute: starts")),
+        rollouts=section.rollouts,
         generator=context.generator("execute: disturbances"),
         progress=context.progress,
     )
@@ -51,10 +69,3 @@ def run(context: StageContext) -> Path:
     path = context.write("execute", record, (planner_file, tracker_file, library_file, *robot_files))
     draw_beside(path, draw_rollouts, context.read("execute"), library_file)
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``execute``."""
-    least = {"queries": 1, "rollouts": 1, "seed": 0}
-    section = config["execute"]
-    return [*key_complaints(section, "execute", tuple(least)), *number_complaints(section, "execute", **least)]

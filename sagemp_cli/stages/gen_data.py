@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sagemp_cli.config.binding import option_complaints
+from sagemp_cli.config.binding import Binding
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.experts import (
     Demonstration,
     Expert,
-    Weights,
     plan_demonstrations,
     solve_problems,
 )
 from sagemp_cli.pipeline.context import StageContext
-from sagemp_cli.pipeline.options import number_complaints, without
 from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.demonstrations import draw_demonstrations
@@ -27,24 +25,23 @@ from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.scenes.sides import side_label
 from sagemp_cli.storage import Demonstrations
 
-_KEYS = ("count", "processes", "weights")
-"""Keys of ``expert`` that are no options of :class:`Expert`."""
+_BESIDE = {"count": Count, "processes": Whole}
+SECTIONS = (Binding("expert", Expert, given=("dynamics", "scene", "horizon"), beside=_BESIDE),)
 _FIGURES = ("cost", "optimality", "control_violation", "state_violation", "clearance", "goal_error")
 
 
 def run(context: StageContext) -> Path:
     """Solve the planned problems that are not finished yet, and write them all."""
-    problem, section = problem_of(context.config), context.config["expert"]
-    count, options = section["count"], without(section, *_KEYS)
-    weights = Weights(**section["weights"])
-    expert = Expert(problem.dynamics.analytical, problem.scene, problem.horizon, weights, **options)
+    problem, options = problem_of(context.config), SECTIONS[0].options(context.config)
+    count, processes = options.pop("count"), options.pop("processes")
+    expert = Expert(problem.dynamics.analytical, problem.scene, problem.horizon, **options)
     problems = plan_demonstrations(problem.start, count, seed=int(context.config["seed"]))
     # A demonstration does not depend on how many there are or who solves it, so these may change between runs.
     partial = PartialResults.of(context, "gen-data", without=("expert.count",))
     done = partial.finished & set(range(count))
     with (
         context.progress.task("demonstrations", count, len(done)) as task,
-        closing(solve_problems(problems, expert, processes=section["processes"], done=done)) as solved,
+        closing(solve_problems(problems, expert, processes=processes, done=done)) as solved,
     ):
         for demonstration in solved:
             partial.save(demonstration.problem.index, _arrays(demonstration))
@@ -54,17 +51,6 @@ def run(context: StageContext) -> Path:
     partial.remove()
     draw_beside(path, draw_demonstrations, context.read("gen-data"))
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``expert``."""
-    section = config["expert"]
-    given = ("dynamics", "scene", "horizon", "weights")
-    return [
-        *number_complaints(section, "expert", count=1, processes=0),
-        *option_complaints(Expert, without(section, *_KEYS), "expert", given=given),
-        *option_complaints(Weights, section.get("weights"), "expert.weights"),
-    ]
 
 
 def _arrays(demonstration: Demonstration) -> dict[str, np.ndarray]:

@@ -6,24 +6,45 @@ its controls are played back, when it is tracked, and whether that is certified.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from sagemp_cli.config.binding import Binding
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.execution import DISTURBANCES, require_certified_safe, try_references
 from sagemp_cli.execution import Trials as Found
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import planner_from, tracker_from
-from sagemp_cli.pipeline.options import key_complaints, number_complaints
 from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.pipeline.proof import Proof
-from sagemp_cli.pipeline.reference_starts import reference_starts, spread_complaints
+from sagemp_cli.pipeline.reference_starts import reference_starts
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.safety import draw_safety
+from sagemp_cli.stages import build_library
 from sagemp_cli.storage import SafetyRates, Trials
+
+
+@dataclass(frozen=True)
+class Options:
+    """The section ``safety``.
+
+    Attributes:
+        references: sampled from the planner.
+        rollouts: starts per reference under each kind of disturbances.
+        seed: of what is sampled.
+        within_limits: whether the controls that are played back are clamped into the robot's limits.
+    """
+
+    references: Count
+    rollouts: Count
+    seed: Whole
+    within_limits: bool
+
+
+SECTIONS = (Binding("safety", Options), build_library.SECTIONS[0])
 
 
 def run(context: StageContext) -> Path:
@@ -35,9 +56,10 @@ def run(context: StageContext) -> Path:
         UsageError: the robot has no inverse.
         SoundnessError: a rollout breaks what was certified; nothing is written.
     """
-    (problem, robot_files), section = trained_problem(context), context.config["safety"]
-    count = section["references"]
-    starts, proof = reference_starts(context.config, problem), Proof.of(context.config, problem)
+    (problem, robot_files), section = trained_problem(context), SECTIONS[0].made(context.config)
+    count = section.references
+    spread = SECTIONS[1].made(context.config).start_spread
+    starts, proof = reference_starts(problem, spread), Proof.of(context.config, problem)
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker, generator = tracker_from(tracker_file), context.generator("safety-rates: references")
     references = planner_from(planner_file).sample(
@@ -50,9 +72,9 @@ def run(context: StageContext) -> Path:
         scene=problem.scene,
         start=problem.start,
         disturbance=problem.disturbance,
-        rollouts=section["rollouts"],
+        rollouts=section.rollouts,
         generator=context.generator("safety-rates: rollouts"),
-        within_limits=section["within_limits"],
+        within_limits=section.within_limits,
         progress=context.progress,
     )
     inputs = (planner_file, tracker_file, *robot_files)
@@ -81,16 +103,6 @@ def run(context: StageContext) -> Path:
     pieces.remove()
     draw_beside(path, draw_safety, context.read("safety-rates"))
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``safety``, and with where references start."""
-    section = config["safety"]
-    found = key_complaints(section, "safety", ("references", "rollouts", "seed", "within_limits"))
-    found += number_complaints(section, "safety", references=1, rollouts=1, seed=0)
-    if not isinstance(section.get("within_limits"), bool):
-        found.append(f"safety.within_limits must be true or false, found {section.get('within_limits')!r}")
-    return found + spread_complaints(config)
 
 
 def _trials(found: Found) -> Trials:

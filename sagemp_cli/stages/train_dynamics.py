@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sagemp_cli.config.binding import option_complaints
+from sagemp_cli.config.binding import Binding
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.identification import EnclosureWeight, learn_dynamics
+from sagemp_cli.identification import learn_dynamics
 from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import curve_of, figures_at_end, weights_of
-from sagemp_cli.pipeline.options import without
 from sagemp_cli.pipeline.partial import PartialFile
 from sagemp_cli.pipeline.problem import robot_of
-from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.report.dynamics import draw_dynamics
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.storage import DynamicsModel
 
-_GIVEN = ("robot", "enclosure", *GIVEN_TO_TRAINING)
+SECTIONS = (Binding("dynamics_training", learn_dynamics, given=("robot", *GIVEN_TO_TRAINING)),)
 
 
 def run(context: StageContext) -> Path:
@@ -38,17 +34,14 @@ def run(context: StageContext) -> Path:
             f"dynamics: {type(robot).__name__} has nothing to learn; "
             f"choose a learned robot, e.g. dynamics=unicycle_learned"
         )
-    section = context.config["dynamics_training"] or {}
-    enclosure = section.get("enclosure")
     partial = PartialFile.of(context, "train-dynamics")
     history, errors = learn_dynamics(
         robot,
         generator=context.generator("train-dynamics"),
-        enclosure=None if enclosure is None else EnclosureWeight(**enclosure),
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **without(section, "enclosure"),
+        **SECTIONS[0].options(context.config),
     )
     figures = figures_at_end(history) | {"parameters": float(sum(p.numel() for p in robot.parameters()))}
     record = DynamicsModel(
@@ -65,16 +58,3 @@ def run(context: StageContext) -> Path:
     partial.remove()
     draw_beside(path, draw_dynamics, context.read("train-dynamics"))
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``dynamics_training`` of a learned robot; others have none."""
-    if not stage_named("train-dynamics").applies(config):
-        return []
-    section = config.get("dynamics_training")
-    if not isinstance(section, Mapping):
-        return option_complaints(learn_dynamics, section, "dynamics_training", given=_GIVEN)
-    return [
-        *option_complaints(learn_dynamics, without(section, "enclosure"), "dynamics_training", given=_GIVEN),
-        *option_complaints(EnclosureWeight, section.get("enclosure"), "dynamics_training.enclosure"),
-    ]

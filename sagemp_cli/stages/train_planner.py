@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagemp_cli.config.binding import build, option_complaints, target_class
+from sagemp_cli.config.binding import Binding, target_class
+from sagemp_cli.config.ranges import Fraction
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.learning.fit import GIVEN_TO_TRAINING, History
 from sagemp_cli.pipeline.context import StageContext
-from sagemp_cli.pipeline.models import curve_of, data_arguments, figures_at_end, weights_of
-from sagemp_cli.pipeline.options import without
+from sagemp_cli.pipeline.models import curve_of, figures_at_end, planner_of, weights_of
 from sagemp_cli.pipeline.partial import PartialFile
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.planners import (
@@ -54,11 +54,7 @@ class _Outcome:
 def run(context: StageContext) -> Path:
     """Build the planner, let it learn from what it learns from, and write it with its model card."""
     problem = problem_of(context.config)
-    planner: StoredPlanner = build(
-        context.config["planner"],
-        "planner",
-        **data_arguments(context.config["planner"], "planner", problem.dynamics, problem.horizon),
-    )
+    planner = planner_of(context.config["planner"], problem.dynamics, problem.horizon)
     learn = {"demonstrations": _from_demonstrations, "scenes": _from_scenes, "nothing": _as_it_is}
     outcome = learn[planner.learns_from](context, problem, planner)
     figures = {"parameters": float(sum(p.numel() for p in planner.parameters()))} | outcome.figures
@@ -76,35 +72,28 @@ def run(context: StageContext) -> Path:
     return path
 
 
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``planner_training``; where nothing is trained, it is not looked at."""
-    try:
-        planner, section = target_class(config["planner"], "planner"), config["planner_training"]
-    except ConfigError:
-        return []  # the complaint of the section ``planner``
-    learns_from = getattr(planner, "learns_from", None)
+def sections(config: Mapping[str, Any]) -> tuple[Binding, ...]:
+    """What ``planner_training`` is bound to, by what the planner learns from; nothing where it learns nothing."""
+    planner = target_class(config["planner"], "planner")
+    learns_from = getattr(planner, "learns_from", "nothing")
     if learns_from == "demonstrations":
-        share, found = section.get("held_out"), []
-        if not isinstance(share, float) or not 0 < share < 1:
-            found.append(f"planner_training.held_out must be a share in (0, 1), found {share!r}")
-        given = ("planner", "demonstrations", "held_out", "scene", "position", *GIVEN_TO_TRAINING)
-        found += option_complaints(train_planner, without(section, "held_out"), "planner_training", given=given)
-        given = ("planner", "demonstrations", "steps")
-        return found + option_complaints(planner.loss_type, section.get("loss"), "planner_training.loss", given=given)
+        about = ("planner", "demonstrations", "held_out", "scene", "position", *GIVEN_TO_TRAINING)
+        return (
+            Binding("planner_training", train_planner, given=about, beside={"held_out": Fraction}),
+            Binding("planner_training.loss", planner.loss_type, given=("planner", "demonstrations", "steps")),
+        )
     if learns_from == "scenes":
-        given = ("self", "scene", *GIVEN_TO_TRAINING)
-        return option_complaints(planner.learn, section, "planner_training", given=given)
-    if learns_from != "nothing":
-        return [f"planner._target_: {planner.__name__} is no planner: it does not say what it learns from"]
-    return []
+        return (Binding("planner_training", planner.learn, given=("self", "scene", *GIVEN_TO_TRAINING)),)
+    return ()
 
 
 def _from_demonstrations(context: StageContext, problem: Problem, planner: LearnedPlanner) -> _Outcome:
     """Train on the demonstrations except the last ones, which are held out for the validation curve."""
-    section = context.config["planner_training"]
+    options = sections(context.config)[0].options(context.config)
+    share = options.pop("held_out")
     source = context.read("gen-data")
     states = torch.from_numpy(source.record.states)
-    kept = len(states) - math.ceil(section["held_out"] * len(states))
+    kept = len(states) - math.ceil(share * len(states))
     if kept < 1:
         raise ConfigError(f"{source.path}: {len(states)} demonstrations are too few to hold some out; set expert.count")
     about = {"scene": problem.scene, "position": problem.dynamics.position}
@@ -118,7 +107,7 @@ def _from_demonstrations(context: StageContext, problem: Problem, planner: Learn
         identity=partial.identity,
         progress=context.progress,
         **about,
-        **without(section, "held_out"),
+        **options,
     )
     shown = {f"demonstrated share {label}": s for label, s in sorted(side_shares(states[:kept], **about).items())}
     return _Outcome(history, {"demonstrations": float(kept)} | figures_at_end(history) | shown, partial, (source,))
@@ -133,7 +122,7 @@ def _from_scenes(context: StageContext, problem: Problem, planner: SelfTaughtPla
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **(context.config["planner_training"] or {}),
+        **sections(context.config)[0].options(context.config),
     )
     return _Outcome(history, figures_at_end(history) | _card(context, problem, planner), partial)
 

@@ -3,35 +3,34 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from sagemp_cli.config.binding import build, option_complaints
+from sagemp_cli.config.binding import NAME, Binding, build
+from sagemp_cli.config.ranges import Count
 from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
-from sagemp_cli.pipeline.options import number_complaints, without
 from sagemp_cli.pipeline.partial import PartialFile
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.training import draw_training
 from sagemp_cli.storage import TrackerModel
-from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.training import train_tracker
-from sagemp_cli.trackers.tube_loss import TubeLoss
+
+_GIVEN = ("tracker", "dynamics", "references", "start", "disturbance", *GIVEN_TO_TRAINING)
+SECTIONS = (Binding("tracker_training", train_tracker, given=_GIVEN, beside={"references": Count}),)
 
 
 def run(context: StageContext) -> Path:
     """Train on references of the planner, starts and disturbances of the sets that will be verified."""
-    (problem, robot_files), section = trained_problem(context), context.config["training"]
-    count, tube = section["references"], section.get("tube")
+    (problem, robot_files), options = trained_problem(context), SECTIONS[0].options(context.config)
+    count = options.pop("references")
     extra = data_arguments(context.config["tracker"], "tracker", problem.dynamics, problem.horizon)
-    arguments = {key: value for key, value in context.config["tracker"].items() if key != "_target_"} | extra
+    arguments = {key: value for key, value in context.config["tracker"].items() if key != NAME} | extra
     with torch.random.fork_rng(devices=[]):  # initial weights depend on the root seed, whatever was drawn before
         torch.manual_seed(context.generator("train-tracker: initial weights").initial_seed())
         tracker: Tracker = build(context.config["tracker"], "tracker", **extra)
@@ -51,11 +50,10 @@ def run(context: StageContext) -> Path:
         start=problem.start,
         disturbance=problem.disturbance,
         generator=context.generator("train-tracker"),
-        tube=None if tube is None else TubeLoss(**tube),
         checkpoint=partial.path,
         identity=partial.identity,
         progress=context.progress,
-        **without(section, "references", "tube"),
+        **options,
     )
     figures = figures_at_end(history)
     record = TrackerModel(
@@ -69,15 +67,3 @@ def run(context: StageContext) -> Path:
     partial.remove()
     draw_beside(path, draw_training, context.read("train-tracker"))
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``training``."""
-    section = config["training"]
-    given = ("tracker", "dynamics", "references", "start", "disturbance", "tube", *GIVEN_TO_TRAINING)
-    return [
-        *number_complaints(section, "training", references=1),
-        *option_complaints(train_tracker, without(section, "references", "tube"), "training", given=given),
-        *option_complaints(LossWeights, section.get("weights"), "training.weights"),
-        *option_complaints(TubeLoss, section.get("tube"), "training.tube"),
-    ]

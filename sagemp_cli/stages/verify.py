@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sagemp_cli.config.binding import option_complaints
+from sagemp_cli.config.binding import Binding
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import planner_from, tracker_from
-from sagemp_cli.pipeline.options import key_complaints, number_complaints
 from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.pipeline.proof import Proof
 from sagemp_cli.pipeline.reference_file import read_references
+from sagemp_cli.pipeline.true_model import SECTION as TRUE_MODEL
 from sagemp_cli.pipeline.true_model import TrueModelProof
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.planners.from_file import FromFile
@@ -25,7 +27,33 @@ from sagemp_cli.verification.attack.falsifier import Counterexample as Found
 from sagemp_cli.verification.attack.refutation import attack, decided
 from sagemp_cli.verification.verdict import answer_of
 
-_KEYS = ("partitions", "budget", "memory", "references", "seed", "file", "falsifier", "true_model")
+_GIVEN = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
+
+
+@dataclass(frozen=True)
+class Options:
+    """The section ``verify``.
+
+    Attributes:
+        references: sampled from the planner, if there is no file; None: one, of a file's planner all.
+        seed: of what is sampled.
+        file: references to verify instead.
+        falsifier: options of :func:`~sagemp_cli.verification.attack.refutation.attack`.
+        true_model: options of :class:`~sagemp_cli.pipeline.true_model.TrueModelProof`.
+    """
+
+    references: Count | None
+    seed: Whole
+    file: str | None
+    falsifier: Mapping[str, Any] | None
+    true_model: Mapping[str, Any] | None
+
+
+SECTIONS = (
+    Binding("verify", Options),
+    Binding("verify.falsifier", attack, given=_GIVEN),
+    TRUE_MODEL,
+)
 
 
 def run(context: StageContext) -> Path:
@@ -33,24 +61,24 @@ def run(context: StageContext) -> Path:
 
     Finished chunks of cells are kept until the certificate is written: an interrupted run goes on from there.
     """
-    (problem, robot_files), section = trained_problem(context), context.config["verify"]
+    (problem, robot_files), section = trained_problem(context), SECTIONS[0].made(context.config)
     proof = Proof.of(context.config, problem)
-    folded = TrueModelProof.of(section["true_model"], proof) if robot_files else None
+    folded = TrueModelProof.of(context.config, proof) if robot_files else None
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker = tracker_from(tracker_file)
     inputs: tuple[Artifact[Any] | Parent, ...] = (planner_file, tracker_file, *robot_files)
-    if section["file"] is None:
+    if section.file is None:
         planner = planner_from(planner_file)
         every = len(planner.trajectories) if isinstance(planner, FromFile) else 1
         references = planner.sample(
             problem.start.center,
             problem.scene.goal,
             scene=problem.scene,
-            count=section["references"] or every,
+            count=section.references or every,
             generator=context.generator("verify: references"),
         )
     else:
-        file = Path(section["file"])
+        file = Path(section.file)
         references = read_references(file, horizon=problem.horizon, state_names=problem.dynamics.state_names)
         inputs = (*inputs, context.source(REFERENCES, file))
     pieces = PartialResults.of(context, "verify", inputs, without=("verify.falsifier",))
@@ -62,7 +90,7 @@ def run(context: StageContext) -> Path:
         scene=problem.scene,
         generator=context.generator("verify: falsifier"),
         progress=context.progress,
-        **(section["falsifier"] or {}),
+        **SECTIONS[1].options(context.config),
     )
     for r, example in refutation.unproved:
         context.progress.say(
@@ -85,18 +113,6 @@ def run(context: StageContext) -> Path:
     pieces.remove()
     draw_beside(path, draw_certificate, context.read("verify"))
     return path
-
-
-def complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the section ``verify``, except its partition (see :mod:`sagemp_cli.pipeline.proof`)."""
-    section, search = config["verify"], config["verify"].get("falsifier")
-    given = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
-    wrong = option_complaints(attack, search, "verify.falsifier", given=given)
-    if not wrong:
-        least = {key: 1 if key == "at_once" else 0 for key in search or {}}
-        wrong = number_complaints(search or {}, "verify.falsifier", **least)
-    least = {"seed": 0} if section["references"] is None else {"seed": 0, "references": 1}
-    return [*key_complaints(section, "verify", _KEYS), *number_complaints(section, "verify", **least), *wrong]
 
 
 def _counterexample(reference: int, found: Found, constraint: str) -> Counterexample:

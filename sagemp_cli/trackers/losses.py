@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from sagemp_cli.config.ranges import NonNegative
 from sagemp_cli.dynamics.base import Dynamics
 
 
@@ -14,9 +15,9 @@ from sagemp_cli.dynamics.base import Dynamics
 class LossWeights:
     """Weights ``lambda_1, lambda_2, lambda_3``, which the paper leaves open."""
 
-    track: float = 1.0
-    state: float = 0.1
-    control: float = 0.1
+    track: NonNegative = 1.0
+    state: NonNegative = 0.1
+    control: NonNegative = 0.1
 
 
 def tracking_loss(states: Tensor, targets: Tensor) -> Tensor:

@@ -1,19 +1,19 @@
 """Training the tracker: back-propagation through closed-loop rollouts on the planner's own references.
 
-``training=plain`` minimises exactly the paper's loss. ``training=certified`` adds the width of a differentiable
-reach tube (forward affine arithmetic through the same loop), with the radius of the sets annealed from small to
-full: the tracker learns to be verifiable, not only to track.
+``tracker_training=plain`` minimises exactly the paper's loss. ``tracker_training=certified`` adds the width of a
+differentiable reach tube (forward affine arithmetic through the same loop), with the radius of the sets annealed from
+small to full: the tracker learns to be verifiable, not only to track.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.config.ranges import Count, Positive, Whole
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.learning.fit import History, fit
@@ -80,14 +80,14 @@ def train_tracker(
     start: Box,
     disturbance: Box,
     generator: torch.Generator,
-    steps: int,
-    batch: int = 64,
-    rollout_steps: int = 40,
-    first_rollout_steps: int | None = None,
-    learning_rate: float = 5e-3,
-    weights: Mapping[str, float] | None = None,
+    steps: Count,
+    batch: Count = 64,
+    rollout_steps: Count = 40,
+    first_rollout_steps: Count | None = None,
+    learning_rate: Positive = 5e-3,
+    weights: LossWeights | None = None,
     tube: TubeLoss | None = None,
-    tube_steps: int = 150,
+    tube_steps: Whole = 150,
     checkpoint: Path | None = None,
     identity: str = "",
     progress: Progress | None = None,
@@ -107,18 +107,18 @@ def train_tracker(
         first_rollout_steps: steps per rollout at the beginning; they grow to ``rollout_steps`` by halfway. Rollouts of
             an untrained tracker on a robot that tumbles leave every bound, and their gradients say nothing.
         learning_rate: peak learning rate.
-        weights: ``track``, ``state``, ``control`` of :class:`LossWeights`.
+        weights: of the loss's parts.
         tube: reachability-aware part, None for the paper's plain loss.
         tube_steps: further gradient steps with the reachability-aware part, from the plainly trained tracker.
         checkpoint, identity, progress: see :func:`sagemp_cli.learning.fit.fit`.
     """
     horizon = references.shape[1] - 1
     if not 1 <= rollout_steps <= horizon:
-        raise ConfigError(f"training.rollout_steps must lie in 1..{horizon}, found {rollout_steps}")
+        raise ConfigError(f"tracker_training.rollout_steps must lie in 1..{horizon}, found {rollout_steps}")
     first = rollout_steps if first_rollout_steps is None else first_rollout_steps
     if not 1 <= first <= rollout_steps:
-        raise ConfigError(f"training.first_rollout_steps must lie in 1..{rollout_steps}, found {first}")
-    loss_weights = LossWeights(**(weights or {}))
+        raise ConfigError(f"tracker_training.first_rollout_steps must lie in 1..{rollout_steps}, found {first}")
+    loss_weights = weights or LossWeights()
     spread = 0.05 * (dynamics.state_upper - dynamics.state_lower)
     sampler = RolloutSampler(references, start, disturbance, spread)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sagemp_cli.config.ranges import Count, NonNegative, Part, Positive
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
@@ -42,18 +43,18 @@ class TubeLoss:
         shrink: share of the full radius at the start of annealing.
     """
 
-    weight: float = 0.3
-    references: int = 6
-    counts: Sequence[int] = (2, 2)
-    steps: int = 60
-    symbols: int = 50
-    scale: Sequence[float] | float = 0.1
-    end: float = 1.0
-    shrink: float = 0.15
+    weight: NonNegative = 0.3
+    references: Count = 6
+    counts: Sequence[Count] = (2, 2)
+    steps: Count = 60
+    symbols: Count = 50
+    scale: Sequence[Positive] | Positive = 0.1
+    end: NonNegative = 1.0
+    shrink: Part = 0.15
 
     def __post_init__(self) -> None:
         if not 0 < self.shrink <= 1:
-            raise ConfigError(f"training.tube.shrink must lie in (0, 1], found {self.shrink}")
+            raise ConfigError(f"tracker_training.tube.shrink must lie in (0, 1], found {self.shrink}")
 
     def __call__(
         self,

@@ -98,9 +98,9 @@ def cells_within(memory: float, cells: int, found: Footprint, propagator: Propag
     working = found.working or 0.0
     if results + working > memory * GIB:
         raise ResourceError(
-            f"verify.memory is {memory:g} GiB, but the tubes and relaxations of up to {cells} cells need "
+            f"proof.memory is {memory:g} GiB, but the tubes and relaxations of up to {cells} cells need "
             f"{results / GIB:.2g} GiB, and '{propagator.name}' {working / GIB:.2g} GiB for one cell at a time; "
-            f"raise verify.memory, or verify fewer references or cells"
+            f"raise proof.memory, or verify fewer references or cells"
         )
     if not working:
         return MOST_AT_ONCE

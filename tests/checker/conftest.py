@@ -25,7 +25,6 @@ from sagemp_cli.verification.problem import Problem
 from sagemp_cli.verification.verification import verify_references
 
 LIMITS = {"unicycle": (4, 2), "planar_quadrotor": (6, 2), "quadrotor": (12, 4)}
-CLASSES = {"unicycle": "Unicycle", "planar_quadrotor": "PlanarQuadrotor", "quadrotor": "Quadrotor"}
 
 
 def config_of(robot: str, **changes: Any) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def config_of(robot: str, **changes: Any) -> dict[str, Any]:
         "name": f"small_{robot}",
         "horizon": 8,
         "dynamics": {
-            "_target_": f"sagemp_cli.dynamics.{robot}.{CLASSES[robot]}",
+            "name": robot,
             "dt": 0.1,
             "control_lower": [-9.0] * m,
             "control_upper": [9.0] * m,
@@ -62,7 +61,7 @@ def config_of(robot: str, **changes: Any) -> dict[str, Any]:
 
 def problem_from(config: dict[str, Any]) -> Problem:
     """What the stages build from such a config."""
-    section = {key: value for key, value in config["dynamics"].items() if key != "_target_"}
+    section = {key: value for key, value in config["dynamics"].items() if key != "name"}
     dynamics = target_class(config["dynamics"], "dynamics")(**section)
     n = dynamics.state_dim
     return Problem(

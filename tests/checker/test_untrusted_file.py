@@ -48,8 +48,8 @@ def rewrite(file, text):
         (lambda c: c["start"].update(radius=[HUGE] * 4), "too large"),
         (lambda c: c["disturbance"].update(lower=[-1.0] * 4), "the disturbance says 'lower'"),
         (lambda c: c["dynamics"].update(dt=HUGE), "too large"),
-        (lambda c: c["dynamics"].update(dt=True), "dynamics.dt must be float, found True"),
-        (lambda c: c["dynamics"].update(_target_="sagemp_cli.dynamics." + "a" * 300 + ".X"), "too long"),
+        (lambda c: c["dynamics"].update(dt=True), "dynamics.dt must be a positive number of seconds, found True"),
+        (lambda c: c["dynamics"].update(name="a" * 300), "too long"),
     ],
 )
 def test_a_config_that_could_be_misunderstood_is_refused(edit, message, certificate, mutate, tmp_path):

@@ -20,13 +20,13 @@ FOLDER = Path("artifacts/unicycle_node")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["verify", "--partitions", "0"], "verify.partitions must be a positive number of cells in all"),
+        (["verify", "--partitions", "0"], "proof.partitions must be a positive number of cells in all"),
         (["verify", "--partitions", "4x"], "2 counts such as 2x2, or auto; found '4x'"),
         (["verify", "--partitions", "it's"], 'found "it\'s"'),
         (["verify", "--partitions", "-4"], "found -4"),
         (
-            ["verify", "--partitions", "2", "verify.partitions=3"],
-            "--partitions 2 and the override verify.partitions=...",
+            ["verify", "--partitions", "2", "proof.partitions=3"],
+            "--partitions 2 and the override proof.partitions=...",
         ),
         (["gen-data", "--seed", "1", "seed=2"], "--seed 1 and the override seed=... contradict each other"),
         (["gen-data", "experiment=unicyle_node"], "unknown experiment (did you mean 'unicycle_node'?)"),
@@ -56,7 +56,7 @@ def test_config_validate_reports_all_errors_of_a_config_at_once(sagemp):
     result = sagemp("config", "validate", "+tracker.width=3", "dynamics.dt=fast")
     assert result.exit_code == 2
     assert "tracker.width: Tracker has no such option" in result.stderr
-    assert "dynamics.dt must be float, found 'fast'" in result.stderr
+    assert "dynamics.dt must be a positive number of seconds, found 'fast'" in result.stderr
 
 
 def test_config_validate_checks_every_option(sagemp):

@@ -89,7 +89,7 @@ def test_verify_with_other_partitions_does_not_replace_the_certificate(sagemp, m
     result = sagemp("verify", "--partitions", "3x3")
     assert result.exit_code == 2
     assert (
-        f"error: {FOLDER}/certificate.h5: exists already and is stale (was made with verify.partitions=4, this config "
+        f"error: {FOLDER}/certificate.h5: exists already and is stale (was made with proof.partitions=4, this config "
         "says 3x3); pass --overwrite to remake it"
     ) in result.stderr
     assert (FOLDER / "certificate.h5").read_bytes() == before

@@ -106,7 +106,7 @@ def test_the_table_of_another_folder(sagemp, stored):
     [
         (["experiment=planar_cfm"], "experiment=planar_cfm has no effect on it, artifacts=DIR has"),
         (["--seed", "3"], "seed=3 has no effect on it"),
-        (["--partitions", "2x2"], "verify.partitions='2x2' has no effect on it"),
+        (["--partitions", "2x2"], "proof.partitions='2x2' has no effect on it"),
         (["--overwrite"], "--table only reads what there is"),
         (["--dry-run"], "--table only reads what there is"),
         (["--time-limit", "5"], "--table only reads what there is"),

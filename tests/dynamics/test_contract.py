@@ -75,7 +75,7 @@ def test_gradients_agree_with_finite_differences(any_robot):
     [
         ({"dt": 0.0}, "dt must be a positive number of seconds, found 0.0"),
         ({"dt": float("inf")}, "dt must be a positive number of seconds, found inf"),
-        ({"disturbance": "both"}, "disturbance must be one of ('derivative', 'state'), found 'both'"),
+        ({"disturbance": "both"}, "disturbance must be one of derivative, state, found 'both'"),
         ({"control_lower": [0.0]}, "control_lower needs {controls} numbers, found 1"),
         ({"state_upper": [1.0, 2.0, 3.0]}, "state_upper needs {states} numbers, found 3"),
     ],
@@ -84,7 +84,7 @@ def test_gradients_agree_with_finite_differences(any_robot):
 def test_a_wrong_option_is_named(name, change, message, make_robot):
     robot = make_robot(name)
     expected = message.format(controls=robot.control_dim, states=robot.state_dim)
-    with pytest.raises(ConfigError, match=re.escape(f"{type(robot).__name__}: {expected}")):
+    with pytest.raises(ConfigError, match=re.escape(expected)):
         make_robot(name, **change)
 
 

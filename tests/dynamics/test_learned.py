@@ -100,16 +100,16 @@ def test_its_step_is_enclosed_with_every_activation(section, activation):
     ("change", "message"),
     [
         ({"inputs": ["thta"]}, r"dynamics.inputs: there is no state 'thta' \(did you mean 'theta'\?\)"),
-        ({"hidden": []}, r"dynamics.hidden must list positive widths, found \[\]"),
+        ({"hidden": []}, r"dynamics.hidden must be a non-empty list of whole numbers of at least 1, found \[\]"),
         (
             {"activation": "tan"},
             r"dynamics.activation must be one of leaky_relu, .*, found 'tan' \(did you mean 'tanh'",
         ),
         (
-            {"model": {"_target_": "sagemp_cli.loop.tracker.Tracker"}},
-            "must be an analytical robot model, found Tracker",
+            {"model": {"name": "mlp"}},
+            "dynamics.model.name 'mlp': no such robot",
         ),
-        ({"model": {"_target_": "os.system"}}, "dynamics.model._target_ 'os.system' is not allowed"),
+        ({"model": 3}, "dynamics.model must be a section with a name, found 3"),
     ],
 )
 def test_a_wrong_section_is_one_line(section, change, message):

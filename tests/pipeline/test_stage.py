@@ -15,9 +15,9 @@ def test_where_the_work_is_done_makes_no_file_stale(stage):
 
 
 def test_the_first_key_that_differs_is_named_with_both_values():
-    found, wanted = compose(["verify.budget=7"]), compose()
-    assert stage_named("verify").difference(found, wanted) == ("verify.budget", 7, 64)
-    assert stage_named("build-library").difference(found, wanted) == ("verify.budget", 7, 64)
+    found, wanted = compose(["proof.budget=7"]), compose()
+    assert stage_named("verify").difference(found, wanted) == ("proof.budget", 7, 64)
+    assert stage_named("build-library").difference(found, wanted) == ("proof.budget", 7, 64)
     assert stage_named("train-tracker").difference(found, wanted) is None
 
 

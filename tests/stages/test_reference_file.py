@@ -87,7 +87,7 @@ def test_a_file_of_references_is_verified_and_resumed_chunk_by_chunk(work, toy_f
     shift = np.zeros((5, 1, 4))
     shift[:, 0, 1] = [0.0, 0.02, -0.02, 0.04, 0.06]
     source = save(tmp_path / "plans.npz", planned + shift)
-    overrides = (f"verify.file={source}", "verify.memory=0.02", "verify.falsifier.restarts=0")
+    overrides = (f"verify.file={source}", "proof.memory=0.02", "verify.falsifier.restarts=0")
 
     def context(**options):
         return work("gen-data", "train-planner", "train-tracker", overrides=overrides, overwrite=True, **options)
@@ -118,14 +118,14 @@ def test_a_file_of_references_is_verified_and_resumed_chunk_by_chunk(work, toy_f
 
 
 def test_too_little_memory_is_one_clear_error(work):
-    context = work("gen-data", "train-planner", "train-tracker", overrides=("verify.memory=0.0001",))
-    with pytest.raises(UsageError, match="verify.memory is 0.0001 GiB, but the tubes and relaxations of up to 4 cells"):
+    context = work("gen-data", "train-planner", "train-tracker", overrides=("proof.memory=0.0001",))
+    with pytest.raises(UsageError, match="proof.memory is 0.0001 GiB, but the tubes and relaxations of up to 4 cells"):
         stage_named("verify").run(context)
     assert not context.output_path("verify").exists()
 
 
 def test_an_adaptive_partition_is_written_and_can_be_read(work):
-    overrides = ("verify.partitions=auto", "verify.budget=8")
+    overrides = ("proof.partitions=auto", "proof.budget=8")
     context = work("gen-data", "train-planner", "train-tracker", overrides=overrides)
     record = read_artifact(stage_named("verify").run(context), Certificate).record
     assert record.verdict == "VERIFIED" and len(record.tubes.cell_reference) <= 8

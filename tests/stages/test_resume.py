@@ -39,11 +39,19 @@ def test_more_demonstrations_keep_the_finished_ones_and_another_expert_does_not(
     assert back.resumed == {"demonstrations": 0}
 
 
+SHORT = ("tracker_training.steps=25", "tracker_training.tube_steps=2")
+
+
 @pytest.mark.parametrize(
     ("name", "record", "needs", "overrides"),
     [
         ("train-planner", PlannerModel, ("gen-data",), ("planner_training.steps=120",)),
-        ("train-tracker", TrackerModel, ("gen-data", "train-planner"), ("training.steps=25", "training.tube_steps=2")),
+        (
+            "train-tracker",
+            TrackerModel,
+            ("gen-data", "train-planner"),
+            SHORT,
+        ),
     ],
 )
 def test_training_goes_on_where_it_was_interrupted_and_ends_in_the_same_bits(work, name, record, needs, overrides):

@@ -22,7 +22,7 @@ from .conftest import Interrupt, assert_same
 STAGE = stage_named("safety-rates")
 INPUTS = ("gen-data", "train-planner", "train-tracker")
 # One cell at a time and in this process: the proof of three references has twelve pieces to go on from.
-PIECES = ("verify.memory=0.005", "executor=serial", "safety.references=3")
+PIECES = ("proof.memory=0.005", "executor=serial", "safety.references=3")
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_a_robot_without_an_inverse_is_one_line(work, monkeypatch):
         ("safety.rollouts=0", "safety.rollouts must be a whole number of at least 1, found 0"),
         ("safety.within_limits=3", "safety.within_limits must be true or false, found 3"),
         ("library.start_spread=2.0", "library.start_spread must be a share of X_I"),
-        ("verify.partitions=0", "partitions must be a positive number of cells in all"),
+        ("proof.partitions=0", "partitions must be a positive number of cells in all"),
     ],
 )
 def test_a_wrong_option_is_one_line_and_nothing_is_written(work, override, message):

@@ -173,10 +173,3 @@ def test_wrong_options_are_found_before_anything_is_trained(override, text):
     with pytest.raises(ConfigError) as caught:
         require_sound_config(compose(["planner=flow_matching", override]))
     assert text in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_planner_that_does_not_say_what_it_learns_from_is_none():
-    config = compose([])
-    config["planner"] = {"_target_": "sagemp_cli.planners.normalizer.Normalizer", "dim": 3}
-    with pytest.raises(ConfigError, match="planner._target_: Normalizer is no planner"):
-        require_sound_config(config)

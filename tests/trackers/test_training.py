@@ -162,7 +162,7 @@ def test_an_interrupted_run_ends_in_the_same_bits(unicycle, references, start, d
 
 
 def test_rollouts_longer_than_the_reference_are_refused(unicycle, references, start, disturbance, make_tracker):
-    with pytest.raises(ConfigError, match=re.escape("training.rollout_steps must lie in 1..12, found 40")):
+    with pytest.raises(ConfigError, match=re.escape("tracker_training.rollout_steps must lie in 1..12, found 40")):
         train_tracker(
             make_tracker(),
             unicycle,

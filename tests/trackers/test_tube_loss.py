@@ -103,5 +103,5 @@ def test_an_exploding_tube_has_a_finite_loss_and_gradient(unicycle, references, 
 
 
 def test_a_wrong_share_is_refused():
-    with pytest.raises(ConfigError, match=re.escape("training.tube.shrink must lie in (0, 1], found 0")):
+    with pytest.raises(ConfigError, match=re.escape("tracker_training.tube.shrink must lie in (0, 1], found 0")):
         TubeLoss(shrink=0)

@@ -117,8 +117,8 @@ def test_too_small_a_budget_is_one_clear_error():
     with pytest.raises(ResourceError) as caught:
         cells_within(0.1, 100, found, Affine())
     assert str(caught.value) == (
-        "verify.memory is 0.1 GiB, but the tubes and relaxations of up to 100 cells need 0.1 GiB, "
-        "and 'affine' 0.01 GiB for one cell at a time; raise verify.memory, or verify fewer references or cells"
+        "proof.memory is 0.1 GiB, but the tubes and relaxations of up to 100 cells need 0.1 GiB, "
+        "and 'affine' 0.01 GiB for one cell at a time; raise proof.memory, or verify fewer references or cells"
     )
 
 

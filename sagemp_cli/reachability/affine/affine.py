@@ -25,6 +25,7 @@ from torch import Tensor
 
 import sagemp_cli.reachability.affine.operations  # noqa: F401  (gives the forms their operations)
 import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the relaxations)
+from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
@@ -70,7 +71,7 @@ class Affine:
         symbols: most generators kept between steps (None: all that are not negligible); the others are boxed, soundly.
     """
 
-    symbols: int | None = None
+    symbols: Count | None = None
     name: str = "affine"
     rigorous: bool = True
 

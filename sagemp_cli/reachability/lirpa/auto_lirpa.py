@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ class AutoLirpa:
         method: ``CROWN`` or ``IBP`` (intervals).
     """
 
-    mode: str = "one_shot"
+    mode: Literal["one_shot", "one_step", "n_step"] = "one_shot"
     steps: int = 10
     method: str = "CROWN"
     name: ClassVar[str] = "auto_lirpa"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
@@ -49,9 +50,9 @@ def attack(
     tracker: Tracker,
     scene: Scene,
     generator: torch.Generator,
-    restarts: int = 16,
-    safe_restarts: int = 2,
-    at_once: int = 4,
+    restarts: Whole = 16,
+    safe_restarts: Whole = 2,
+    at_once: Count = 4,
     progress: Progress | None = None,
 ) -> Refutation:
     """Search for counterexamples by gradient ascent on starts and disturbances.

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sagemp_cli.config.ranges import Positive
 from sagemp_cli.errors import ConfigError, ResourceError
 from sagemp_cli.verification.cells import CellProver, CellTubes, Chunk, Run
 
@@ -19,7 +20,7 @@ class Dask:
     """The workers of a scheduler (dask.distributed), which need this version of sagemp installed.
 
     A chunk whose worker dies is proved by another one. Give each worker one thread (``dask worker --nthreads 1``) and
-    the memory of one chunk, see ``verify.memory``. Functions and results travel as Dask sends them, which lets whoever
+    the memory of one chunk, see ``proof.memory``. Functions and results travel as Dask sends them, which lets whoever
     is on the scheduler's network run code: use one that you trust.
 
     Attributes:
@@ -28,7 +29,7 @@ class Dask:
     """
 
     address: str
-    timeout: float = 30.0
+    timeout: Positive = 30.0
     name: ClassVar[str] = "dask"
 
     def __post_init__(self) -> None:
@@ -36,8 +37,6 @@ class Dask:
             raise ConfigError(
                 f"executor.address must be that of a Dask scheduler such as tcp://10.0.0.1:8786, found '{self.address}'"
             )
-        if not self.timeout > 0:
-            raise ConfigError(f"executor.timeout must be positive, found {self.timeout}")
 
     @contextmanager
     def opened(self, prover: CellProver) -> Iterator[Run]:

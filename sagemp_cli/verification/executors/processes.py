@@ -14,7 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from sagemp_cli.errors import ConfigError, ResourceError
+from sagemp_cli.config.ranges import Count, Whole
+from sagemp_cli.errors import ResourceError
 from sagemp_cli.verification.cells import CellProver, CellTubes, Chunk, Run
 from sagemp_cli.verification.executors.serial import Serial
 from sagemp_cli.workers import be_a_worker, one_thread_per_child
@@ -24,7 +25,7 @@ _prover: CellProver | None = None  # a worker's own copy, sent once when it star
 
 @dataclass(frozen=True)
 class Processes:
-    """Spawned workers with one thread each. Memory: each holds one chunk, see ``verify.memory``.
+    """Spawned workers with one thread each. Memory: each holds one chunk, see ``proof.memory``.
 
     Attributes:
         workers: how many; None for one per core.
@@ -32,15 +33,9 @@ class Processes:
             takes seconds to start.
     """
 
-    workers: int | None = None
-    least: int = 256
+    workers: Count | None = None
+    least: Whole = 256
     name: ClassVar[str] = "processes"
-
-    def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise ConfigError(f"executor.workers must be a positive whole number or null, found {self.workers}")
-        if self.least < 0:
-            raise ConfigError(f"executor.least must not be negative, found {self.least}")
 
     @contextmanager
     def opened(self, prover: CellProver) -> Iterator[Run]:
@@ -69,7 +64,7 @@ class Processes:
         except BrokenProcessPool:
             raise ResourceError(
                 "a worker process died (out of memory?); run again to go on, "
-                "with fewer executor.workers or less verify.memory"
+                "with fewer executor.workers or less proof.memory"
             ) from None
         finally:
             if pool is not None:

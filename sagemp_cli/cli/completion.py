@@ -1,0 +1,37 @@
+"""What Tab completes: options of config groups, config keys, stages. Nothing heavy is imported."""
+
+from __future__ import annotations
+
+import typer
+
+from sagemp_cli.errors import SagempError
+
+PIPELINE = "The pipeline"
+"""Panel of the help that the stages are in."""
+
+
+def complete_override(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Overrides that begin with what is typed: ``experiment=unicycle_node``, ``planner.hidden=``.
+
+    Bash splits words at ``=``: it asks for what follows, and the words before are among the arguments.
+    """
+    from sagemp_cli.config.composition import groups, known_keys, options_of
+
+    words = " ".join(ctx.params.get("overrides") or []).replace(" = ", "=").removesuffix(" =").split()
+    try:
+        if words and "=" not in words[-1]:
+            return [option for option in options_of(words[-1]) if option.startswith(incomplete)]
+        group, given, typed = incomplete.partition("=")
+        if given:
+            return [f"{group}={option}" for option in options_of(group) if option.startswith(typed)]
+        names = dict.fromkeys([*groups(), *known_keys([word for word in words if "=" in word])])
+        return [f"{name}=" for name in names if name.startswith(incomplete)]
+    except SagempError:
+        return []  # what was typed before is wrong, which the command will say
+
+
+def complete_stage(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Stages that begin with what is typed."""
+    commands = getattr(ctx.find_root().command, "commands", {})
+    stages = [name for name, command in commands.items() if getattr(command, "rich_help_panel", None) == PIPELINE]
+    return [name for name in stages if name.startswith(incomplete)]
