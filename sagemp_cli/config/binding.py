@@ -30,7 +30,7 @@ from sagemp_cli.plugins.registry import resolve
 NAME = "name"
 """The key that says which robot, planner, ... a section is about."""
 
-_PLAIN = (int, float, str, bool)
+_PLAIN = (int, float, str, bool, dict, list, tuple)
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def _things_built(options: dict[str, Any], hints: Mapping[str, Any], where: str)
     wrong: list[str] = []
     for key, value in options.items():
         hint = hints.get(key)
-        if not inspect.isclass(hint) or hint in (dict, *_PLAIN) or is_dataclass(hint):
+        if not inspect.isclass(hint) or hint in (Any, *_PLAIN) or is_dataclass(hint):
             continue
         try:
             built = build(value, f"{where}.{key}")

@@ -129,11 +129,11 @@ def _chosen(override: Any) -> str:
 
 
 def _store_plugins() -> None:
-    """Make plugins known to Hydra as options of their groups; a config file of the same name goes before."""
+    """Make plugins that have no config file known to Hydra as options of their groups."""
     from hydra.core.config_store import ConfigStore
 
     for group in KINDS:
-        for name in _plugins(group):
+        for name in (name for name in _plugins(group) if config_file(group, name) is None):
             ConfigStore.instance().store(group=group, name=name, node={"name": name})
 
 

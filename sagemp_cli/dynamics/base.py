@@ -7,12 +7,15 @@ only operations for which the propagators have a relaxation (an unknown one is a
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import torch
 from annotated_types import Gt, doc
 from torch import Tensor, nn
 
+from sagemp_cli.dynamics.flatness import Array
 from sagemp_cli.errors import ConfigError
 
 DISTURBANCE_READINGS = ("derivative", "state")
@@ -34,6 +37,10 @@ class Dynamics(nn.Module):
     control_units: tuple[str, ...]
     position: tuple[int, ...]
     """Indices of the state that are the position in the scene."""
+    angles: tuple[str, ...] = ()
+    """Names of the states that are angles, so that 2 pi more is the same."""
+    rates: Mapping[str, str] = MappingProxyType({})
+    """Of each state that is the rate of change of another one, that one's name, so that plans may leave it out."""
     control_lower: Tensor
     control_upper: Tensor
     state_lower: Tensor
@@ -83,6 +90,17 @@ class Dynamics(nn.Module):
     def analytical(self) -> Dynamics:
         """The model of formulas that this one stands for: itself, unless it was learned from another."""
         return self
+
+    def filled_in(self, known: Mapping[str, Array]) -> Iterator[tuple[str, Array, str]]:
+        """States that follow from others which a plan has, where :attr:`rates` do not say it: none by default.
+
+        Args:
+            known: values ``(K+1,)`` by name, which grow by what is given; the positions are among them.
+
+        Yields:
+            A state's name, its values ``(K+1,)`` and, in a few words, what they are; those that a plan has are kept.
+        """
+        yield from ()
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative ``f(x, u)``; ``x (..., n)``, ``u (..., m)`` to ``(..., n)``."""

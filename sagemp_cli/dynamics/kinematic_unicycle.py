@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import torch
 from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.flatness import Array, heading
 
 
 class KinematicUnicycle(Dynamics):
@@ -21,6 +24,11 @@ class KinematicUnicycle(Dynamics):
     control_names = ("v", "turn_rate")
     control_units = ("m/s", "rad/s")
     position = (0, 1)
+    angles = ("theta",)
+
+    def filled_in(self, known: Mapping[str, Array]) -> Iterator[tuple[str, Array, str]]:
+        """The heading, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
+        yield "theta", heading(known["px"], known["py"], self.dt), "direction of the position's differences"
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""

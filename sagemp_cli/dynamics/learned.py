@@ -64,7 +64,7 @@ class Learned(Dynamics):
         # Before the base class, whose checks ask for the dimensions.
         self.state_names, self.state_units = robot.state_names, robot.state_units
         self.control_names, self.control_units = robot.control_names, robot.control_units
-        self.position = robot.position
+        self.position, self.angles, self.rates = robot.position, robot.angles, robot.rates
         super().__init__(
             dt=robot.dt,
             control_lower=robot.control_lower.tolist(),

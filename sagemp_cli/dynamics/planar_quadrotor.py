@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+
 import torch
 from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.flatness import Array, planar_tilt
 
 
 class PlanarQuadrotor(Dynamics):
@@ -22,6 +26,8 @@ class PlanarQuadrotor(Dynamics):
     control_names = ("thrust", "torque")
     control_units = ("N", "N m")
     position = (0, 1)
+    angles = ("phi",)
+    rates = MappingProxyType({"vx": "px", "vz": "pz", "omega": "phi"})
 
     def __init__(
         self,
@@ -33,6 +39,10 @@ class PlanarQuadrotor(Dynamics):
     ) -> None:
         super().__init__(**common)
         self.mass, self.gravity, self.inertia = float(mass), float(gravity), float(inertia)
+
+    def filled_in(self, known: Mapping[str, Array]) -> Iterator[tuple[str, Array, str]]:
+        """The tilt, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
+        yield "phi", planar_tilt(known["vx"], known["vz"], self.dt), "tilt from the differences of the velocity"
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.flatness import Array, tilt
 from sagemp_cli.errors import ConfigError
 
 
@@ -31,6 +36,9 @@ class Quadrotor(Dynamics):
     control_names = ("thrust", "torque_x", "torque_y", "torque_z")
     control_units = ("N", "N m", "N m", "N m")
     position = (0, 1, 2)
+    angles = ("psi", "theta", "phi")
+    # body rates are the angles' only where tilts are small
+    rates = MappingProxyType({"vx": "px", "vy": "py", "vz": "pz", "p": "phi", "q": "theta", "r": "psi"})
 
     def __init__(
         self,
@@ -45,6 +53,13 @@ class Quadrotor(Dynamics):
             raise ConfigError(f"Quadrotor: inertia needs 3 numbers, found {len(inertia)}")
         self.mass, self.gravity = float(mass), float(gravity)
         self.inertia = tuple(float(i) for i in inertia)
+
+    def filled_in(self, known: Mapping[str, Array]) -> Iterator[tuple[str, Array, str]]:
+        """The attitude, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
+        yield "psi", np.zeros_like(known["pz"]), "taken as 0"
+        theta, phi = tilt(known["vx"], known["vy"], known["vz"], known["psi"], self.dt)
+        yield "theta", theta, "tilt from the differences of the velocity"
+        yield "phi", phi, "tilt from the differences of the velocity"
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""

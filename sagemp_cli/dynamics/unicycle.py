@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import torch
 from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.flatness import Array, heading, speed
 
 
 class Unicycle(Dynamics):
@@ -20,6 +23,12 @@ class Unicycle(Dynamics):
     control_names = ("turn_rate", "acceleration")
     control_units = ("rad/s", "m/s^2")
     position = (0, 1)
+    angles = ("theta",)
+
+    def filled_in(self, known: Mapping[str, Array]) -> Iterator[tuple[str, Array, str]]:
+        """Speed and heading, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""
+        yield "v", speed(known["px"], known["py"], self.dt), "speed of the position's differences"
+        yield "theta", heading(known["px"], known["py"], self.dt), "direction of the position's differences"
 
     def derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed state derivative, see :class:`~sagemp_cli.dynamics.base.Dynamics`."""

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.planners.base import starts_of
-from sagemp_cli.planners.completion import ANGLES, POSITIONS, complete
+from sagemp_cli.planners.completion import complete
 from sagemp_cli.planners.trajectory_file import RecordedTrajectory, read_trajectories
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
@@ -36,7 +37,10 @@ class FromFile(nn.Module):
         horizon: number of steps K.
         dt: seconds a step.
         state_names: names of the states.
+        robot: with ``path``: says what follows from what.
         path: the file.
+        position: without ``robot``: indices of the states that are the position.
+        angles: without ``robot``: names of the states that are angles.
         count: instead of ``path``: how many trajectories there are, which ``load_state_dict`` brings then.
         notes: with ``count``: what was done when the file was read.
     """
@@ -52,21 +56,28 @@ class FromFile(nn.Module):
         horizon: int,
         dt: float,
         state_names: list[str],
+        robot: Dynamics | None = None,
         path: str | None = None,
+        position: list[int] | None = None,
+        angles: list[str] | None = None,
         count: int | None = None,
         notes: list[str] | None = None,
     ) -> None:
         super().__init__()
         if (path is None) == (count is None):
             raise ConfigError("planner.path must name a file of trajectories, e.g. planner.path=plans.csv")
+        if path is not None and robot is None:
+            raise ConfigError("planner: a file of trajectories is read for a robot, which must be given with its path")
         self.state_dim, self.horizon, self.dt = int(state_dim), int(horizon), float(dt)
         self.state_names = [str(name) for name in state_names]
+        self.position = list(robot.position if robot is not None else position or ())
+        self.angles = list(robot.angles if robot is not None else angles or ())
         self.source = None if path is None else Path(path)
         self.notes = [str(note) for note in notes or ()]
-        if path is None:
-            trajectories = torch.zeros(int(count), self.horizon + 1, self.state_dim, dtype=torch.float64)
+        if path is None or robot is None:
+            trajectories = torch.zeros(int(count or 0), self.horizon + 1, self.state_dim, dtype=torch.float64)
         else:
-            trajectories = torch.from_numpy(self._read(Path(path)))
+            trajectories = torch.from_numpy(self._read(Path(path), robot))
         self.register_buffer("trajectories", trajectories)
 
     @property
@@ -77,6 +88,8 @@ class FromFile(nn.Module):
             "horizon": self.horizon,
             "dt": self.dt,
             "state_names": self.state_names,
+            "position": self.position,
+            "angles": self.angles,
             "count": len(self.trajectories),
             "notes": self.notes,
         }
@@ -89,17 +102,17 @@ class FromFile(nn.Module):
         are moved by multiples of 2 pi to lie next to the start's. For starts ``(count, n)``, each gets its closest.
         """
         starts = starts_of(start, count=count, state_dim=self.state_dim)
-        where = [i for i, name in enumerate(self.state_names) if name in POSITIONS]
+        where = self.position
         apart = torch.linalg.vector_norm(self.trajectories[:, 0, where] - starts[:, None, where], dim=-1)
         ranked = apart.argsort(dim=1, stable=True)
         rank = torch.zeros(count, dtype=torch.long) if start.dim() == 2 else torch.arange(count) % ranked.shape[1]
         references = self.trajectories[ranked[torch.arange(count), rank]].clone()
-        turning = [i for i, name in enumerate(self.state_names) if name in ANGLES]
+        turning = [i for i, name in enumerate(self.state_names) if name in self.angles]
         turns = torch.round((starts[:, turning] - references[:, 0, turning]) / (2 * math.pi))
         references[..., turning] += 2 * math.pi * turns[:, None]
         return references
 
-    def _read(self, path: Path) -> np.ndarray:
+    def _read(self, path: Path, robot: Dynamics) -> np.ndarray:
         found = [
             self._resampled(trajectory, path) for trajectory in read_trajectories(path, state_names=self.state_names)
         ]
@@ -107,7 +120,7 @@ class FromFile(nn.Module):
             raise ArtifactError(f"{path}: holds no trajectory")
         filled = []
         for name, states in found:
-            rows, notes = complete(states, state_names=self.state_names, dt=self.dt, where=f"{path}: {name}")
+            rows, notes = complete(states, robot, where=f"{path}: {name}")
             self.notes += [note for note in notes if note not in self.notes]
             filled.append(rows)
         return np.stack(filled)
@@ -140,6 +153,6 @@ class FromFile(nn.Module):
         if lasts < duration * (1 - 1e-9) - 0.5 * self.dt:
             self.notes.append(f"{trajectory.name} ends after {lasts:g} s and keeps its last row until {duration:g} s")
         return trajectory.name, {
-            name: np.interp(steps, time - time[0], np.unwrap(values) if name in ANGLES else values)
+            name: np.interp(steps, time - time[0], np.unwrap(values) if name in self.angles else values)
             for name, values in trajectory.states.items()
         }

@@ -7,13 +7,21 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.dynamics.unicycle import Unicycle
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.planners import FromFile, Planner
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 
 SCENE = Scene(Box(torch.zeros(2), torch.ones(2)), (), Box(torch.zeros(4), torch.ones(4)))
-OPTIONS = {"state_dim": 4, "horizon": 10, "dt": 0.1, "state_names": ["px", "py", "theta", "v"]}
+LIMITS = {"control_lower": [-9, -9], "control_upper": [9, 9], "state_lower": [-9] * 4, "state_upper": [9] * 4}
+OPTIONS = {
+    "state_dim": 4,
+    "horizon": 10,
+    "dt": 0.1,
+    "state_names": ["px", "py", "theta", "v"],
+    "robot": Unicycle(dt=0.1, **LIMITS),
+}
 
 
 def sample(planner, start, count):
