@@ -12,7 +12,7 @@ from sagemp_cli.plugins import planner, robot
 
 @robot("my_robot")
 class MyRobot(Dynamics):
-    """``x = [px, py, theta, v, omega]``, ``u = [v_command, omega_command]``; speeds follow commands after ``lag`` seconds."""
+    """``x = [px, py, theta, v, omega]``, ``u = [v_command, omega_command]``; speeds follow commands with a lag."""
 
     state_names = ("px", "py", "theta", "v", "omega")
     state_units = ("m", "m", "rad", "m/s", "rad/s")
@@ -50,7 +50,7 @@ class MyRobot(Dynamics):
 
 @planner("detour")
 def detour(start, goal, scene, count, generator, *, horizon: int, dt: float, widest: float = 0.2) -> Tensor:
-    """Plans ``(count, K+1, 5)`` past the pillar: half a sine wave to the goal's middle, a little different each time."""
+    """Plans ``(count, K+1, 5)`` past the pillar to the goal's middle, a little different each time."""
     share = torch.linspace(0, 1, horizon + 1, dtype=torch.float64)
     height = 1.0 + widest * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     length = (goal.lower[0] + goal.upper[0]) / 2 - start[:, :1]

@@ -14,8 +14,8 @@ from sagemp_cli.errors import ArtifactError
 def complete(states: Mapping[str, Array], robot: Dynamics, *, where: str) -> tuple[Array, list[str]]:
     """All states ``(K+1, n)`` in their order, and one line for each that was filled in.
 
-    A state that is another one's rate of change (the robot's ``rates``) is that one's differences; then come the robot's
-    own rules (:meth:`~sagemp_cli.dynamics.base.Dynamics.filled_in`), and rates of what these gave.
+    A state that is another one's rate of change (the robot's ``rates``) is that one's differences; then come the
+    robot's own rules (:meth:`~sagemp_cli.dynamics.base.Dynamics.filled_in`), and rates of what these gave.
 
     Args:
         states: values ``(K+1,)`` by name at the robot's time step.

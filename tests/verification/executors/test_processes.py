@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.config.binding import build
 from sagemp_cli.errors import ConfigError, ResourceError
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellTubes, Chunk
@@ -112,4 +113,4 @@ def test_tubes_come_back_from_arrays_as_they_went(small):
 )
 def test_wrong_numbers_are_refused(options, message):
     with pytest.raises(ConfigError, match=message):
-        Processes(**options)
+        build({"name": "processes"} | options, "executor")
