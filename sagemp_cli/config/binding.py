@@ -301,12 +301,14 @@ def _sentences(error: ValidationError, model: type[BaseModel], options: Any, whe
             if inner is None or not keys:
                 break
             section, here = inner, _dotted(here, key)
-        full, name = _dotted(here, key), section.__name__
+        full = _dotted(here, key)
+        # What only holds a section's options is not worth a word; what is built or called with them is.
+        name = "" if section.__name__.endswith("Options") else section.__name__
         if found["type"] == "missing":
             missing.setdefault((here, name), []).append(key)
         elif found["type"] == "extra_forbidden":
             near = did_you_mean(key, fields) or f"; known: {', '.join(fields) or 'none'}"
-            yield f"{full}: {name} has no such option{near}"
+            yield f"{full}: {name} has no such option{near}" if name else f"{full}: no such option{near}"
         elif found["type"] == "value_error":
             yield str(found["ctx"]["error"])
         elif inner is not None:
@@ -315,7 +317,7 @@ def _sentences(error: ValidationError, model: type[BaseModel], options: Any, whe
             near = did_you_mean(value, _choices(fields[key].annotation)) if isinstance(value, str) else ""
             yield f"{full} must be {fields[key].title}, found {_short(value)}{near}"
     for (here, name), keys in missing.items():
-        yield f"{here}: {name} needs {', '.join(keys)}" if here else f"the config needs {', '.join(keys)}"
+        yield f"{here}: {name} needs {', '.join(keys)}" if name else f"{here or 'the config'} needs {', '.join(keys)}"
 
 
 def _section_in(annotation: Any) -> type[BaseModel] | None:

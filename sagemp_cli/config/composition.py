@@ -7,6 +7,7 @@ class. How sections become objects is in :mod:`sagemp_cli.config.binding`.
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,7 @@ def _chosen(override: Any) -> str:
 
     group, option = override.key_or_group, override.value()
     if group == "experiment" and _is_file(option):
-        option = f"_{Path(option).stem}"
+        option = re.sub(r"\W", "_", f"_{option}")
         ConfigStore.instance().store(group=group, name=option, node=_experiment(override.value()), package="_global_")
         return f"{group}={option}"
     return str(override.input_line)
@@ -282,7 +283,7 @@ def _check_override(override: Any, before: Mapping[str, Any]) -> None:
         top = sorted({k.partition(".")[0] for k in before})
         near = did_you_mean(key, before)
         raise ConfigError(f"{key}: unknown key{near}" + ("" if near else f"; known at the top: {', '.join(top)}"))
-    if isinstance(before[key], dict) and not isinstance(new, dict) and key != "scene":
+    if isinstance(before[key], dict) and not isinstance(new, dict | None) and key != "scene":
         raise ConfigError(f"{key} is a section, found {new!r}; its keys: {', '.join(before[key])}")
 
 

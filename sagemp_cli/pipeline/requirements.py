@@ -20,7 +20,7 @@ Section = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Effort:
+class EffortOptions:
     """The section ``effort``: a word, and what it adds to the names of folders."""
 
     name: str
@@ -28,7 +28,7 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Centered:
+class StartOptions:
     """The section ``start``; the problem checks the numbers, which belong to the robot's states."""
 
     center: Any
@@ -36,14 +36,14 @@ class Centered:
 
 
 @dataclass(frozen=True)
-class Radius:
+class DisturbanceOptions:
     """The section ``disturbance``."""
 
     radius: Any
 
 
 @dataclass(frozen=True)
-class Config:
+class ConfigOptions:
     """The keys at the top, and which of them are sections; what is in these is said where it is read."""
 
     name: str
@@ -52,9 +52,9 @@ class Config:
     seed: Whole
     horizon: Count
     scene: Section
-    start: Centered
-    disturbance: Radius
-    effort: Effort
+    start: StartOptions
+    disturbance: DisturbanceOptions
+    effort: EffortOptions
     dynamics: Section
     expert: Section
     planner: Section
@@ -71,7 +71,9 @@ class Config:
     planner_training: Section | None = None
 
 
-_SECTIONS = tuple(f.name for f in fields(Config) if f.type not in ("str", "Whole", "Count") and "None" not in f.type)
+_SECTIONS = tuple(
+    f.name for f in fields(ConfigOptions) if f.type not in ("str", "Whole", "Count") and "None" not in f.type
+)
 
 
 def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> None:
@@ -84,7 +86,7 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
     Raises:
         ConfigError: one line with every complaint.
     """
-    found = option_complaints(Config, config, "")
+    found = option_complaints(ConfigOptions, config, "")
     if not all(isinstance(config.get(name), Mapping) for name in _SECTIONS):
         raise ConfigError("; ".join(found))
     for section in KINDS:

@@ -16,13 +16,20 @@ from sagemp_cli.cli.main import app
 from sagemp_cli.config import composition as config_module
 from sagemp_cli.pipeline.stage import STAGES
 
-_composed = functools.cache(config_module._composed)
+
+@functools.cache
+def _composed(overrides, surroundings, composed=config_module._composed):
+    return composed(overrides)
 
 
 @pytest.fixture(autouse=True)
 def quick_config(monkeypatch):
     """Hydra composes each config once for all tests of this folder: it takes longer than everything else here."""
-    monkeypatch.setattr(config_module, "_composed", lambda overrides: copy.deepcopy(_composed(tuple(overrides))))
+
+    def quick(overrides):
+        return copy.deepcopy(_composed(tuple(overrides), config_module._surroundings()))
+
+    monkeypatch.setattr(config_module, "_composed", quick)
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ FOLDER = Path("artifacts/unicycle_node")
         (["status", "horizn=3"], "horizn: unknown key (did you mean 'horizon'?)"),
         (["inspect", "none.h5"], "none.h5: no such file"),
         (["inspect", "."], ".: is a folder, an HDF5 file is needed"),
-        (["config", "show", "seed=x"], "seed must be a whole number (it is 0), found 'x'"),
+        (["status", "seed=x"], "seed must be a whole number of at least 0, found 'x'"),
         (["config", "list", "planner=zzz"], "planner=zzz: unknown planner"),
     ],
 )

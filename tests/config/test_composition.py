@@ -169,7 +169,7 @@ def test_a_wrong_override_is_one_line_that_names_it(override, message):
         (["tracker_training.tube.scal=1"], "tracker_training.tube.scal"),
         (["seed=-1"], "seed must be a whole number of at least 0, found -1"),
         (["planner.method=eulr"], "planner.method must be one of euler, rk4, found 'eulr' (did you mean 'euler'?)"),
-        (["+planer_training={}"], "planer_training: Config has no such option (did you mean 'planner_training'?)"),
+        (["+planer_training={}"], "planer_training: no such option (did you mean 'planner_training'?)"),
     ],
 )
 def test_a_config_that_cannot_work_is_refused_before_any_work(overrides, message):

@@ -166,7 +166,7 @@ def test_options_of_a_planner_that_teaches_itself_are_those_of_its_own(tmp_path,
     [
         ("+planner_training.loss.batch=3", "planner_training.loss.batch: FlowMatchingLoss has no such option"),
         ("+planner.integrator=rk4", "planner.integrator: FlowMatching has no such option"),
-        ("planner.knots=few", "planner.knots must be int, found 'few'"),
+        ("planner.knots=few", "planner.knots must be a whole number of at least 1, found 'few'"),
     ],
 )
 def test_wrong_options_are_found_before_anything_is_trained(override, text):
