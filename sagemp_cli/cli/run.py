@@ -14,7 +14,7 @@ import typer
 from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.completion import complete_stage
 from sagemp_cli.cli.options import DryRun, Overrides, Partitions, Seed, TimeLimit, overrides_of
-from sagemp_cli.cli.stage_command import announce, context_of
+from sagemp_cli.cli.stage_command import announce, context_of, draw_if_missing
 from sagemp_cli.cli.time_limit import time_limit as limited
 from sagemp_cli.errors import EXIT_FALSIFIED, ArtifactError, UsageError, did_you_mean
 
@@ -101,6 +101,8 @@ def _make(context: StageContext, stages: Sequence[Stage], *, dry_run: bool, pref
             raise ArtifactError(f"{state.path}: {state.why}; move it away, 'sagemp run' does not replace it")
         if state.freshness is Freshness.FRESH:
             typer.echo(f"{prefix}{stage.name}: up to date ({state.path})")
+            if not dry_run:
+                draw_if_missing(context, stage)
             continue
         experiment = state.header.experiment if state.header else context.config["name"]
         if experiment != context.config["name"]:

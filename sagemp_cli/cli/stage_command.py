@@ -13,6 +13,7 @@ from sagemp_cli.errors import ArtifactError
 if TYPE_CHECKING:
     from sagemp_cli.pipeline.context import StageContext
     from sagemp_cli.pipeline.freshness import FileState
+    from sagemp_cli.pipeline.stage import Stage
 
 
 def context_of(overrides: list[str], *, overwrite: bool = False) -> StageContext:
@@ -71,7 +72,10 @@ def output_of(
             explain(context, states, name)
         return None
     with time_limit(seconds):
-        return (state.path if known else state.stage.run(context)), known
+        if not known:
+            return state.stage.run(context), known
+        draw_if_missing(context, state.stage)
+        return state.path, known
 
 
 def _refuse_existing(state: FileState, overwrite: bool) -> None:
@@ -113,6 +117,12 @@ def explain(context: StageContext, states: dict[str, FileState], name: str) -> N
     for source in state.stage.inputs_in(context.config):
         typer.echo(f"  read     {states[source].path} ({states[source].freshness})")
     typer.echo(f"  {'replace' if state.path.exists() else 'write':<7}  {state.path}")
+
+
+def draw_if_missing(context: StageContext, stage: Stage) -> None:
+    """Draw the figure of a file that is up to date, if it is not there: an interrupt may have come before it."""
+    if context.owner(stage.name) is context and not context.output_path(stage.name).with_suffix(".png").exists():
+        context.progress.say(f"figure {stage.draw(context)}")
 
 
 def announce(path: Path) -> None:

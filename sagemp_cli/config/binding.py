@@ -21,11 +21,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import AfterValidator, AllowInfNan, BaseModel, ConfigDict, Field, Strict, ValidationError, create_model
 from pydantic_core import PydanticUndefined
 
+from sagemp_cli.config.memory import memory_limit
 from sagemp_cli.config.ranges import OrInfinite
 from sagemp_cli.config.wording import described
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
 from sagemp_cli.plugins import KINDS
 from sagemp_cli.plugins.registry import resolve
+
+_MOST_MEMORY = 2**30
+"""Bytes that an object may take; those of this project take a few MB."""
 
 NAME = "name"
 """The key that says which robot, planner, ... a section is about."""
@@ -163,10 +167,13 @@ def build(section: Mapping[str, Any], where: str, **extra: Any) -> Any:
     if not inspect.isclass(function):
         return functools.partial(function, **options, **extra)
     try:
-        return function(**options, **extra)
-    except (TypeError, ValueError) as e:
-        first = next((line for line in str(e).splitlines() if line.strip()), type(e).__name__)
-        raise ConfigError(f"{where}: {first.strip()}") from e
+        with memory_limit(_MOST_MEMORY):
+            return function(**options, **extra)
+    except (TypeError, ValueError, ArithmeticError, MemoryError, RuntimeError) as e:
+        first = next((line for line in str(e).splitlines() if line.strip()), type(e).__name__).strip()
+        if "memory" in first or isinstance(e, MemoryError):
+            first = f"needs more than {_MOST_MEMORY >> 20} MiB of memory; its sizes must be smaller"
+        raise ConfigError(f"{where}: {first}") from e
 
 
 def parameters_of(function: Callable[..., Any]) -> dict[str, tuple[inspect.Parameter, Callable[..., Any]]]:

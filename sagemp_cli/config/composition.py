@@ -14,10 +14,12 @@ from typing import Any
 
 import yaml
 
-from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.errors import ArtifactError, ConfigError, did_you_mean
 from sagemp_cli.plugins import KINDS
 from sagemp_cli.plugins.project import current_project
 from sagemp_cli.plugins.registry import from_outside
+from sagemp_cli.reading.plain_yaml import plain_yaml
+from sagemp_cli.reading.regular import is_there, require_regular
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _ROOT = "sagemp"
@@ -80,6 +82,13 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     Raises:
         ConfigError: one line that names the override or key, with the nearest known name.
     """
+    try:
+        return _checked(overrides)
+    except RecursionError:
+        raise ConfigError("config: an override is nested too deep") from None
+
+
+def _checked(overrides: Sequence[str]) -> dict[str, Any]:
     parsed = [_parse(text) for text in overrides]
     choices = tuple(_chosen(o) for o in parsed if _is_group(o.key_or_group))
     values = [o for o in parsed if not _is_group(o.key_or_group)]
@@ -331,13 +340,16 @@ def _put(config: dict[str, Any], dotted: str, value: Any) -> None:
     config[last] = value
 
 
+_LARGEST_YAML = 1_000_000
+
+
 def load_scene(scene: Any) -> Any:
     """Replace a scene's name or path by the content of its YAML file; mappings pass through."""
     if not isinstance(scene, str):
         return scene
     folder = resource_folder("data") / "scenes"
     if "/" in scene or scene.endswith((".yaml", ".yml")):
-        if not Path(scene).is_file():
+        if not is_there(Path(scene)):
             raise ConfigError(f"scene '{scene}': no such file (looked for {Path(scene).resolve()})")
         return _mapping_in(Path(scene), f"scene file {scene}")
     known = sorted(p.stem for p in folder.glob("*.yaml"))
@@ -352,11 +364,17 @@ def load_scene(scene: Any) -> Any:
 def _mapping_in(path: Path, what: str) -> dict[str, Any]:
     """The mapping in a YAML file."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if require_regular(path, "a file in YAML") > _LARGEST_YAML:
+            raise ConfigError(f"{what}: is larger than {_LARGEST_YAML} bytes")
+        data = plain_yaml(path.read_text(encoding="utf-8"))
+    except ArtifactError as e:
+        raise ConfigError(f"{what}: {str(e).removeprefix(f'{path}: ')}") from None
     except OSError as e:
         raise ConfigError(f"{what}: cannot be read ({e.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as e:
         raise ConfigError(f"{what}: not readable as YAML ({_first_line(e)})") from None
+    except ValueError as e:
+        raise ConfigError(f"{what}: {e}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{what}: must hold a mapping, found {type(data).__name__}")
     return data

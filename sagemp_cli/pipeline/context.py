@@ -8,6 +8,7 @@ import os
 import shlex
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ class StageContext:
         progress: where to report to.
         started: for the seconds in the header.
         typed: the overrides of the call as they were typed, for commands in messages; None if nobody typed any.
+        resources: what is given back when the stage ends, however it ends.
     """
 
     config: Mapping[str, Any]
@@ -41,11 +43,19 @@ class StageContext:
     progress: Progress = field(default_factory=Silent)
     started: float = field(default_factory=time.monotonic)
     typed: tuple[str, ...] | None = None
+    resources: ExitStack = field(default_factory=ExitStack)
 
     @classmethod
     def of(cls, config: Mapping[str, Any], **options: Any) -> StageContext:
-        """The context of a config: its folder is ``<artifacts>/<name><effort.suffix>``."""
-        return cls(config, Path(config["artifacts"]) / f"{config['name']}{config['effort']['suffix']}", **options)
+        """The context of a config: its folder is ``<artifacts>/<name><effort.suffix>``.
+
+        Raises:
+            ConfigError: these are not names of folders.
+        """
+        _require_folder("artifacts", str(config["artifacts"]))
+        return cls(
+            config, Path(config["artifacts"]) / _name(f"{config['name']}{config['effort']['suffix']}"), **options
+        )
 
     def generator(self, purpose: str) -> torch.Generator:
         """A generator that depends on the purpose (``stage`` or ``stage: what for``) and that stage's seed only."""
@@ -176,7 +186,28 @@ class StageContext:
             parents=self.parents(inputs),
             seconds=time.monotonic() - self.started,
         )
-        return write_artifact(self.output_path(stage), record, header, overwrite=self.overwrite)
+        path = write_artifact(self.output_path(stage), record, header, overwrite=self.overwrite)
+        path.with_suffix(".png").unlink(missing_ok=True)  # of the file that is gone; its own is drawn next
+        return path
+
+
+_LONGEST_NAME = 100
+
+
+def _name(text: str) -> str:
+    """An experiment's name as that of a folder, which lies in the folder of artifacts whatever it says."""
+    right = text[:1].isalnum() or text[:1] == "_"
+    if not right or len(text) > _LONGEST_NAME or not all(c.isalnum() or c in "_-.+" for c in text):
+        raise ConfigError(
+            f"name (with effort.suffix) must be a folder's name: at most {_LONGEST_NAME} letters, digits and _ - . +, "
+            f"a letter, digit or _ first; found {text!r}"
+        )
+    return text
+
+
+def _require_folder(key: str, text: str) -> None:
+    if not text.strip() or not text.isprintable():
+        raise ConfigError(f"{key} must be the path of a folder, found {text!r}")
 
 
 def named_run_file(config: Mapping[str, Any], name: str, stage: str) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.planners.base import StoredPlanner
 from sagemp_cli.planners.own import OwnPlanner
 from sagemp_cli.plugins import KINDS
+from sagemp_cli.reading.plain_json import plain_mapping
 from sagemp_cli.storage import Artifact, DynamicsModel, PlannerModel, TrackerModel, TrainingCurve
 
 
@@ -59,7 +59,7 @@ def planner_from(artifact: Artifact[PlannerModel]) -> StoredPlanner:
     arguments = _arguments(artifact.record.arguments, artifact)
     try:
         if hasattr(target_class(config["planner"], "planner"), "learns_from"):
-            module = build({NAME: config["planner"].get(NAME), **arguments}, "planner")
+            module = build({**arguments, NAME: config["planner"].get(NAME)}, "planner")
         else:
             module = planner_of(config["planner"], build(config["dynamics"], "dynamics"), config["horizon"])
     except ConfigError as e:
@@ -89,7 +89,7 @@ def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:
     """
     arguments = _arguments(artifact.record.arguments, artifact)
     try:
-        module = build({NAME: artifact.header.config["tracker"].get(NAME), **arguments}, "tracker")
+        module = build({**arguments, NAME: artifact.header.config["tracker"].get(NAME)}, "tracker")
     except ConfigError as e:
         raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)
@@ -119,13 +119,20 @@ def figures_at_end(history: History) -> dict[str, float]:
     return figures | {name: float(values[-1]) for name, values in sorted(history.validation.items())}
 
 
+_MOST_NUMBERS = 100
+
+
 def _arguments(text: str, artifact: Artifact[Any]) -> dict[str, Any]:
+    """Constructor arguments in an artifact: untrusted input, whose types the binding checks."""
     try:
-        arguments = json.loads(text)
-    except json.JSONDecodeError as e:
-        raise ArtifactError(f"{artifact.path}: constructor arguments are not JSON ({e})") from None
-    if not isinstance(arguments, dict):
-        raise ArtifactError(f"{artifact.path}: arguments must be a mapping, found {type(arguments).__name__}")
+        arguments = plain_mapping(text, "/data/arguments")
+    except ValueError as e:
+        raise ArtifactError(f"{artifact.path}: {e}") from None
+    for key, value in arguments.items():
+        if isinstance(value, list) and len(value) > _MOST_NUMBERS and isinstance(value[0], int | float):
+            raise ArtifactError(
+                f"{artifact.path}: /data/arguments: '{key}' has {len(value)} numbers, more than {_MOST_NUMBERS}"
+            )
     return arguments
 
 

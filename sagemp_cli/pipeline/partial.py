@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from sagemp_cli import __version__
 from sagemp_cli.errors import ArtifactError, ResourceError
+from sagemp_cli.pipeline.claim import Claim, remove_unused
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.reading.reader import read_arrays
@@ -41,11 +41,19 @@ def work_identity(context: StageContext, stage: str, inputs: Inputs = (), *, wit
 class PartialResults:
     """Numbered pieces as NPZ files without pickles, in a folder that is named after the work's identity.
 
+    Runs of the same work at the same time share them: a piece is the same whoever makes it.
+
     Attributes:
-        folder: ``<stage's partial folder>/<identity>``; pieces of other work beside it are removed.
+        claim: of ``<stage's partial folder>/<identity>``; pieces of other work beside it are removed, unless a run
+            uses them.
     """
 
-    folder: Path
+    claim: Claim
+
+    @property
+    def folder(self) -> Path:
+        """Where the pieces are."""
+        return self.claim.folder
 
     @classmethod
     def of(
@@ -53,7 +61,7 @@ class PartialResults:
     ) -> PartialResults:
         """Open the pieces of a stage, dropping those that a changed config or input has made stale."""
         identity = work_identity(context, stage, inputs, without=without)
-        return cls(_folder_of_its_own(context.partial_folder(stage), identity))
+        return cls(_claimed(context, stage, identity))
 
     @property
     def finished(self) -> set[int]:
@@ -89,7 +97,7 @@ class PartialResults:
 
     def remove(self) -> None:
         """Remove all pieces: the stage's output is written."""
-        shutil.rmtree(self.folder.parent)
+        self.claim.remove()
 
     def _path(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
@@ -100,33 +108,38 @@ class PartialFile:
     """The checkpoint of a training stage.
 
     Attributes:
-        path: the file; it is removed when the work that it belongs to has changed.
+        claim: of the folder that it is in; it is removed when the work that it belongs to has changed.
         identity: what the checkpoint must say.
     """
 
-    path: Path
+    claim: Claim
     identity: str
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.claim.folder / "checkpoint.h5"
 
     @classmethod
     def of(cls, context: StageContext, stage: str, inputs: Inputs = ()) -> PartialFile:
         """Where the stage's checkpoint is; a checkpoint of other work beside it is removed."""
         identity = work_identity(context, stage, inputs)
-        results = _folder_of_its_own(context.partial_folder(stage), identity)
-        return cls(results / "checkpoint.h5", identity)
+        return cls(_claimed(context, stage, identity), identity)
 
     def remove(self) -> None:
         """Remove the checkpoint: the stage's output is written."""
-        shutil.rmtree(self.path.parent.parent)
+        self.claim.remove()
 
 
-def _folder_of_its_own(parent: Path, identity: str) -> Path:
-    """Make ``parent/identity`` and remove whatever else is in ``parent``: it belongs to work that has changed."""
-    folder = parent / identity
+def _claimed(context: StageContext, stage: str, identity: str) -> Claim:
+    """Claim the folder of a stage's work until the stage ends, and remove those of other work that nobody uses."""
+    parent = context.partial_folder(stage)
+    claim = Claim(parent / identity)
+    context.resources.callback(claim.release)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for other in parent.iterdir():
-            if other != folder:
-                shutil.rmtree(other) if other.is_dir() else other.unlink()
+            if other != claim.folder:
+                remove_unused(other)
     except OSError as e:
         raise ResourceError(f"{parent}: cannot be written: {e.strerror or e}") from e
-    return folder
+    return claim

@@ -94,7 +94,7 @@ class Stage:
         return self.output.removesuffix(".h5")
 
     def run(self, context: StageContext) -> Path:
-        """Run the stage (``sagemp_cli.stages.<name>.run``) and return the path of what it wrote.
+        """Run the stage (``sagemp_cli.stages.<name>.run``), draw its figure, and return the path of what it wrote.
 
         Raises:
             ConfigError: another experiment makes the file, or the stage has :meth:`complaints`.
@@ -104,7 +104,14 @@ class Stage:
         wrong = self.complaints(context.config)
         if wrong:
             raise ConfigError("; ".join(wrong))
-        return self._module.run(context)
+        with context.resources:
+            path = self._module.run(context)
+        self.draw(context)
+        return path
+
+    def draw(self, context: StageContext) -> Path:
+        """Draw the figure of the stage's file, which is there (``sagemp_cli.stages.<name>.draw``); return its path."""
+        return self._module.draw(context)
 
     def require_own(self, context: StageContext) -> None:
         """Raise if the file comes from elsewhere.

@@ -140,10 +140,12 @@ class Scene:
 def _numbers(where: str, values: Any, size: int) -> tuple[float, ...]:
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise ConfigError(f"{where} must be a list of numbers, found {values!r}")
+    if any(isinstance(v, bool) or not (isinstance(v, int | float) or v in ("inf", "-inf")) for v in values):
+        raise ConfigError(f"{where} must be a list of numbers, found {list(values)!r}")
     try:
         out = tuple(float(v) for v in values)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{where} must be a list of numbers, found {list(values)!r}") from None
+    except OverflowError:
+        raise ConfigError(f"{where} holds a number that is too large") from None
     if len(out) != size:
         raise ConfigError(f"{where} needs {size} numbers, found {len(out)}")
     if any(v != v for v in out):

@@ -91,6 +91,9 @@ def run(context: StageContext) -> Path:
         wanted=section.size,
         dynamics=robot_files[0].record.weights if robot_files else None,
     )
-    path = context.write("build-library", record, (planner_file, tracker_file, *robot_files))
-    draw_beside(path, draw_library, context.read("build-library"))
-    return path
+    return context.write("build-library", record, (planner_file, tracker_file, *robot_files))
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("build-library"), draw_library, context.read("build-library"))

@@ -66,6 +66,11 @@ def run(context: StageContext) -> Path:
         in_tube=done.in_tube.numpy(),
         safe=done.safe.numpy(),
     )
-    path = context.write("execute", record, (planner_file, tracker_file, library_file, *robot_files))
-    draw_beside(path, draw_rollouts, context.read("execute"), library_file)
-    return path
+    return context.write("execute", record, (planner_file, tracker_file, library_file, *robot_files))
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(
+        context.output_path("execute"), draw_rollouts, context.read("execute"), context.read("build-library")
+    )

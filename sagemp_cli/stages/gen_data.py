@@ -49,8 +49,12 @@ def run(context: StageContext) -> Path:
     found = [partial.load(index) for index in range(count)]
     path = context.write("gen-data", _record(found, len(problem.dynamics.position)))
     partial.remove()
-    draw_beside(path, draw_demonstrations, context.read("gen-data"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("gen-data"), draw_demonstrations, context.read("gen-data"))
 
 
 def _arrays(demonstration: Demonstration) -> dict[str, np.ndarray]:

@@ -101,8 +101,12 @@ def run(context: StageContext) -> Path:
     )
     path = context.write("safety-rates", record, inputs)
     pieces.remove()
-    draw_beside(path, draw_safety, context.read("safety-rates"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("safety-rates"), draw_safety, context.read("safety-rates"))
 
 
 def _trials(found: Found) -> Trials:

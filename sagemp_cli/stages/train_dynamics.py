@@ -56,5 +56,9 @@ def run(context: StageContext) -> Path:
     )
     path = context.write("train-dynamics", record)
     partial.remove()
-    draw_beside(path, draw_dynamics, context.read("train-dynamics"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("train-dynamics"), draw_dynamics, context.read("train-dynamics"))

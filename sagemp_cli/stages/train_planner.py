@@ -68,8 +68,12 @@ def run(context: StageContext) -> Path:
     path = context.write("train-planner", record, outcome.inputs)
     if outcome.partial is not None:
         outcome.partial.remove()
-    draw_beside(path, draw_planner, context.read("train-planner"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("train-planner"), draw_planner, context.read("train-planner"))
 
 
 def sections(config: Mapping[str, Any]) -> tuple[Binding, ...]:

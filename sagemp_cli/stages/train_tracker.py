@@ -65,5 +65,9 @@ def run(context: StageContext) -> Path:
     )
     path = context.write("train-tracker", record, inputs)
     partial.remove()
-    draw_beside(path, draw_training, context.read("train-tracker"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("train-tracker"), draw_training, context.read("train-tracker"))

@@ -111,8 +111,12 @@ def run(context: StageContext) -> Path:
     )
     path = context.write("verify", record, inputs)
     pieces.remove()
-    draw_beside(path, draw_certificate, context.read("verify"))
     return path
+
+
+def draw(context: StageContext) -> Path:
+    """Draw the figure of what is there."""
+    return draw_beside(context.output_path("verify"), draw_certificate, context.read("verify"))
 
 
 def _counterexample(reference: int, found: Found, constraint: str) -> Counterexample:

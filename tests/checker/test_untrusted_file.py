@@ -64,10 +64,11 @@ ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" f
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda t: "start:\n  center: [0.0, 0.0, 0.0, 1.0]\n  radius: [9.0, 9.0, 9.0, 9.0]\n" + t, "could be misread"),
-        (lambda t: t.replace("horizon: 8", "horizon: 010"), "could be misread"),
+        (lambda t: "start:\n  center: [0.0, 0.0, 0.0, 1.0]\n  radius: [9.0, 9.0, 9.0, 9.0]\n" + t, "is there twice"),
+        (lambda t: t.replace("horizon: 8", "horizon: 010"), "can be read in two ways"),
+        (lambda t: t.replace("horizon: 8", "horizon: +8"), "could be misread"),
         (lambda t: ALIASES + t.replace("name: disc", "name: *a39"), "holds an alias"),
-        (lambda t: "q: &q {dt: 0.2}\n" + t.replace("  dt: 0.1\n", "  <<: *q\n"), "holds an alias"),
+        (lambda t: "q: &q {dt: 0.2}\n" + t.replace("  dt: 0.1\n", "  <<: *q\n"), "can be read in two ways"),
         (lambda t: t + "z: " + "[" * 1500, "levels deep"),
         (lambda t: t + "z: " + "[" * 200_000, "characters, more than"),
     ],

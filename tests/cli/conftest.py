@@ -70,13 +70,18 @@ def made_up(monkeypatch, example):
                 found = () if safe else record.counterexamples
                 known = {"dynamics": None, "true_model": None} | state.certificate  # of an analytical robot
                 record = dataclasses.replace(record, tubes=tubes, counterexamples=found, **known)
-            path = context.write(stage.name, record, parents)
-            path.with_suffix(".png").write_bytes(b"a figure")
+            return context.write(stage.name, record, parents)
+
+        def draw(context):
+            path = context.output_path(stage.name).with_suffix(".png")
+            path.write_bytes(b"a figure")
             return path
 
-        return run
+        return run, draw
 
     for stage in STAGES:
         module = importlib.import_module(f"sagemp_cli.stages.{stage.name.replace('-', '_')}")
-        monkeypatch.setattr(module, "run", fake(stage))
+        run, draw = fake(stage)
+        monkeypatch.setattr(module, "run", run)
+        monkeypatch.setattr(module, "draw", draw)
     return state

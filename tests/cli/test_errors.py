@@ -38,6 +38,13 @@ FOLDER = Path("artifacts/unicycle_node")
         (["inspect", "none.h5"], "none.h5: no such file"),
         (["inspect", "."], ".: is a folder, an HDF5 file is needed"),
         (["status", "seed=x"], "seed must be a whole number of at least 0, found 'x'"),
+        (["gen-data", "name=../.."], "letters, digits and _ - . +, a letter, digit or _ first; found '../..'"),
+        (["gen-data", "name=/root/x"], "must be a folder's name"),
+        (["gen-data", "name=..", "effort=toy"], "must be a folder's name"),
+        (["gen-data", "name=''"], "must be a folder's name"),
+        (["gen-data", 'name="a\tb"'], "must be a folder's name"),
+        (["gen-data", "effort.suffix=/../.."], "must be a folder's name"),
+        (["gen-data", "artifacts=''"], "artifacts must be the path of a folder, found ''"),
         (["config", "list", "planner=zzz"], "planner=zzz: unknown planner"),
     ],
 )

@@ -192,3 +192,32 @@ def test_a_scene_file_that_is_none_is_refused(tmp_path, text, message):
     path.write_text(text, encoding="latin-1")
     with pytest.raises(ConfigError, match=f"scene file {path}: .*{message}"):
         load_scene(str(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("obstacles:\n- {kind: ball, radius: 0.25, radius: 0.01}", "line 2: the key 'radius' is there twice"),
+        ("workspace: {lower: [010, 1:30], upper: [yes, 4]}", "'010' can be read in two ways"),
+        ("a: " + 2000 * "[" + 2000 * "]", "nested more than 100 levels deep"),
+        ("a: &x 1\nb: *x", "alias"),
+        ("[", "not readable as YAML"),
+        ("a: 1\n" * 200_001, "is larger than"),
+    ],
+)
+def test_a_scene_file_that_can_be_misread_is_refused(tmp_path, text, message):
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="scene file .*scene.yaml: ") as error:
+        load_scene(str(path))
+    assert message in str(error.value)
+
+
+def test_a_scene_given_too_deep_or_by_a_pipe_is_one_line(tmp_path):
+    import os
+
+    os.mkfifo(tmp_path / "scene.yaml")
+    with pytest.raises(ConfigError, match="scene.yaml: is a pipe"):
+        load_scene(str(tmp_path / "scene.yaml"))
+    with pytest.raises(ConfigError, match="nested too deep"):
+        compose(["scene=" + "{a:" * 2000 + "1" + "}" * 2000])

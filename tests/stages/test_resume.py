@@ -15,7 +15,8 @@ def test_gen_data_goes_on_where_it_was_interrupted(work, toy_folder):
         stage.run(work(progress=Interrupt(after=5)))
     context = work(progress=Interrupt())
     assert not context.output_path("gen-data").exists()
-    kept = PartialResults.of(context, "gen-data", without=("expert.count",)).finished
+    with context.resources:
+        kept = PartialResults.of(context, "gen-data", without=("expert.count",)).finished
     assert kept == {0, 1, 2, 3, 4}
     again = read_artifact(stage.run(context), Demonstrations).record
     assert context.progress.resumed == {"demonstrations": 5}
@@ -92,3 +93,46 @@ def test_a_changed_parent_is_refused(work):
     demonstrations.write_bytes(demonstrations.read_bytes() + b"\0")
     with pytest.raises(ArtifactError, match="was made from an earlier .*demonstrations.h5, which has changed since"):
         stage_named("train-tracker").run(context)
+
+
+def test_two_runs_at_once_of_the_same_work_both_end_well(work):
+    stage, inner = stage_named("gen-data"), []
+
+    class Meanwhile(Interrupt):
+        def advance(self, steps=1, note=""):
+            super().advance(steps, note)
+            if self.advanced == 3:
+                inner.append(stage.run(work(overwrite=True)))
+
+    outer = stage.run(work(overwrite=True, progress=Meanwhile()))
+    assert [outer] == inner
+    assert read_artifact(outer, Demonstrations).unchanged
+    assert not work().partial_folder("gen-data").exists()
+
+
+def test_a_run_of_another_config_leaves_the_pieces_of_one_that_is_running(work):
+    stage = stage_named("gen-data")
+
+    class Meanwhile(Interrupt):
+        def advance(self, steps=1, note=""):
+            super().advance(steps, note)
+            if self.advanced == 3:
+                with pytest.raises(KeyboardInterrupt):
+                    stage.run(work(progress=Interrupt(after=1), overrides=("expert.margin=0.31",)))
+                assert len(list(context.partial_folder("gen-data").iterdir())) == 2
+
+    context = work(progress=Meanwhile())
+    stage.run(context)
+    assert not list(context.partial_folder("gen-data").rglob("000003.npz"))
+
+
+def test_a_figure_that_is_missing_is_drawn_and_one_of_an_earlier_file_is_not_kept(work, monkeypatch):
+    stage, context = stage_named("gen-data"), work(overwrite=True)
+    figure = stage.run(context).with_suffix(".png")
+    assert figure.exists()
+    monkeypatch.setattr(type(stage), "draw", lambda *_: None)  # interrupted before it is drawn
+    stage.run(work(overwrite=True))
+    assert not figure.exists()
+    monkeypatch.undo()
+    assert stage.draw(context) == figure
+    assert figure.exists()
