@@ -34,6 +34,7 @@ LABEL = "trajectory"
 _HDF5 = (".h5", ".hdf5")
 _LARGEST_CSV = 2**26
 _LARGEST = 1e9
+_LATEST = 1e20
 
 Array = NDArray[np.float64]
 
@@ -188,9 +189,10 @@ def _require_sound(path: Path, trajectory: RecordedTrajectory) -> None:
         if values is not None and not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
             raise ArtifactError(f"{where} has {name} = {values[row]} in row {row}; numbers must be finite")
-        if name != TIME and (np.abs(values) > _LARGEST).any():
-            row = int(np.argmax(np.abs(values) > _LARGEST))
-            raise ArtifactError(f"{where} has {name} = {values[row]:g} in row {row}; at most {_LARGEST:g} is allowed")
+        most, unit = (_LATEST, " s; t is in seconds") if name == TIME else (_LARGEST, "")
+        if values is not None and (np.abs(values) > most).any():
+            row = int(np.argmax(np.abs(values) > most))
+            raise ArtifactError(f"{where} has {name} = {values[row]:g} in row {row}; at most {most:g}{unit} is allowed")
     if trajectory.time is not None and not (np.diff(trajectory.time) > 0).all():
         row = int(np.argmin(np.diff(trajectory.time) > 0)) + 1
         before, now = trajectory.time[row - 1], trajectory.time[row]

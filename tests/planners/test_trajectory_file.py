@@ -1,5 +1,7 @@
 """Files of trajectories: what is read, and every kind of file that is refused."""
 
+import time
+
 import h5py
 import numpy as np
 import pytest
@@ -137,3 +139,28 @@ def test_other_kinds_of_files_and_groups_and_pickles_are_refused(tmp_path):
     np.savez(tmp_path / "plan.npz", px=np.array([{"any": "object"}], dtype=object))
     with pytest.raises(ArtifactError, match="cannot be read .*allow_pickle=False"):
         read_trajectories(tmp_path / "plan.npz", state_names=NAMES)
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "message"),
+    [
+        ("t,px", [(0, 0), (1e308, 1)], r"t = 1e\+308 in row 1; at most 1e\+20 s; t is in seconds is allowed"),
+        ("t,px", [(0, 1e300), (1, 1)], r"px = 1e\+300 in row 0; at most 1e\+09 is allowed"),
+        (",".join(f"c{i}" for i in range(200_000)), [(0, 1)], "'c0' is not recognised"),
+        (",".join(["px"] * 200_000), [(0, 1)], "has two columns 'px'"),
+    ],
+)
+def test_numbers_and_tables_beyond_all_measure_are_one_line_at_once(tmp_path, header, rows, message):
+    path = tmp_path / "plan.csv"
+    path.write_text("\n".join([header, *(f"{a},{b}" for a, b in rows)]))
+    began = time.monotonic()
+    with pytest.raises(ArtifactError, match=message):
+        read_trajectories(path, state_names=NAMES)
+    assert time.monotonic() - began < 5
+
+
+def test_a_csv_that_is_too_large_is_refused_before_it_is_read(tmp_path):
+    with (tmp_path / "plan.csv").open("wb") as file:
+        file.truncate(2**26 + 1)
+    with pytest.raises(ArtifactError, match="a CSV may have 64 MiB, HDF5 and NPZ hold more"):
+        read_trajectories(tmp_path / "plan.csv", state_names=NAMES)

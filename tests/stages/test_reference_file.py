@@ -4,7 +4,6 @@ import pytest
 
 from sagemp_cli.errors import ArtifactError, NonFiniteError, UsageError
 from sagemp_cli.pipeline.freshness import Freshness, survey
-from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.reference_file import read_references
 from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.storage import Certificate, read_artifact, sha256_of
@@ -97,7 +96,7 @@ def test_a_file_of_references_is_verified_and_resumed_chunk_by_chunk(work, toy_f
     stopped = context(progress=Interrupt())
     assert not stopped.output_path("verify").exists()
     (folder,) = stopped.partial_folder("verify").iterdir()
-    done = PartialResults(folder).finished
+    done = set(folder.glob("*.npz"))
     assert len(done) > 0
     path = stage.run(stopped)
     assert 0 < stopped.progress.resumed["propagating cells"] < 20
