@@ -24,7 +24,9 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TextIO
 
 import h5py
 import numpy as np
@@ -57,21 +59,52 @@ def main() -> None:
         work(given.worker, range(given.seed, given.seed + given.mutants))
         return
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    counts, findings, seed, end = Counter(), [], given.seed, given.seed + given.mutants
+    tally, seed, end = Tally(given.out.with_suffix(".summary.json")), given.seed, given.seed + given.mutants
     with tempfile.TemporaryDirectory() as folder, given.out.open("a") as out:
         prepare(Path(folder))
         while seed < end:
-            seed = watch(Path(folder), seed, end, counts, findings, out)
-    print(json.dumps({"mutants": given.mutants, "commands": counts, "findings": len(findings)}, indent=2))
-    sys.exit(bool(findings))
+            seed = watch(Path(folder), seed, end, tally, out)
+    tally.save(seed)
+    print(tally.path.read_text())
+    sys.exit(tally.findings > 0)
 
 
-def watch(folder: Path, seed: int, end: int, counts: Counter, findings: list, out) -> int:
+@dataclass
+class Tally:
+    """What was done so far, saved every now and then: a campaign takes hours."""
+
+    path: Path
+    ends: Counter[str] = field(default_factory=Counter)
+    slowest: float = 0.0
+    most_mib: int = 0
+    findings: int = 0
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Count the end of one command."""
+        self.ends[f"{line['command']} -> {line['code']}"] += 1
+        self.slowest = max(self.slowest, line["seconds"])
+        self.most_mib = max(self.most_mib, line["memory"] >> 20)
+        if self.ends.total() % 100 == 0:
+            self.save(line["seed"])
+
+    def save(self, seed: int) -> None:
+        """Write it down, with the seed that comes next."""
+        self.path.write_text(json.dumps({**vars(self), "path": self.path.name, "seed": seed}, indent=2))
+
+
+def watch(folder: Path, seed: int, end: int, tally: Tally, out: TextIO) -> int:
     """Run one worker until it is done or hangs; the seed to go on with."""
     command = [sys.executable, __file__, "--worker", str(folder), "--seed", str(seed), "--mutants", str(end - seed)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
     os.set_blocking(process.stdout.fileno(), False)
     heard, text, about = time.monotonic(), b"", {"seed": seed, "command": "start"}
+
+    def note(line: dict[str, Any]) -> None:
+        tally.findings += 1
+        out.write(json.dumps(line) + "\n")
+        out.flush()
+
     while True:
         part = process.stdout.read()
         if part:
@@ -81,19 +114,15 @@ def watch(folder: Path, seed: int, end: int, counts: Counter, findings: list, ou
             if line["what"] == "begin":
                 about = line
                 continue
-            counts[f"{line['command']} -> {line['code']}"] += 1
+            tally.add(line)
             if line["wrong"]:
-                findings.append(line)
-                out.write(json.dumps(line) + "\n")
-                out.flush()
+                note(line)
         ended, hangs = process.poll() is not None, time.monotonic() - heard > 3 * SECONDS
         if ended and not part and process.returncode == 0:
             return end
         if (ended and not part) or hangs:
             process.kill()
-            line = about | {"wrong": "hangs" if hangs else f"the process ended with {process.wait()}"}
-            findings.append(line)
-            out.write(json.dumps(line) + "\n")
+            note(about | {"wrong": "hangs" if hangs else f"the process ended with {process.wait()}"})
             return about["seed"] + 1
         time.sleep(0.2)
 

@@ -21,6 +21,7 @@ from sagemp_cli.reading.tree import Dataset, Group
 
 R = TypeVar("R")
 _DIM = re.compile(r"^(?P<name>[A-Za-z_]+)(?P<shift>[+-]\d+)?$")
+_LARGE, _MOST_SHRUNK = 2**24, 10
 _SCALARS: dict[str, tuple[type, ...]] = {"str": (str,), "bool": (bool,), "int": (int,), "float": (float, int)}
 
 
@@ -125,6 +126,9 @@ def _dataset(node: h5py.Group, name: str, data: np.ndarray, meta: Mapping[str, A
         if data.nbytes > 65536:
             options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     d = node.create_dataset(name, data=data, **options)
+    if data.nbytes > _LARGE and data.nbytes > _MOST_SHRUNK * d.id.get_storage_size():
+        del node[name]  # a reader takes what unpacks into many times its size for a bomb
+        d = node.create_dataset(name, data=data, fletcher32=True)
     if meta["doc"]:
         d.attrs["doc"] = meta["doc"]
     if meta["units"]:

@@ -163,3 +163,13 @@ def test_data_kept_in_another_file_is_refused(node, tmp_path):
     node.create_dataset("states", shape=(2, 3), dtype="f8", external=[(str(tmp_path / "raw"), 0, 48)])
     with pytest.raises(RefusedError, match="/data/states is stored in another file"):
         read_record(node, Sample, "f.h5")
+
+
+def test_our_own_large_arrays_are_no_bombs_however_well_they_would_pack(node, monkeypatch):
+    rows = np.full((300, 300), np.inf)  # an unbounded tube
+    write_record(node.create_group("small"), sample(states=np.zeros((300, 301)), controls=rows, label=("",) * 300))
+    monkeypatch.setattr(records, "_LARGE", 2**18)
+    write_record(node.create_group("large"), sample(states=np.zeros((300, 301)), controls=rows, label=("",) * 300))
+    assert node["small/controls"].id.get_storage_size() * 20 < rows.nbytes
+    assert node["large/controls"].id.get_storage_size() >= rows.nbytes
+    assert node["large/controls"].fletcher32
