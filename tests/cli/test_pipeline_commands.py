@@ -437,6 +437,8 @@ def test_stages_that_sample_take_another_seed_on_the_same_trained_files(sagemp, 
     assert read_artifact(FOLDER / "rollouts.h5", Rollouts).header.seed == 3
     assert read_artifact(FOLDER / "tracker.h5", TrackerModel).header.seed == 0
     assert sagemp("verify", "--seed", "4").exit_code == 2  # nothing that exists is replaced unasked
+
+
 @pytest.mark.parametrize("command", [("run", "--until", "verify"), ("verify",)])
 def test_a_figure_that_is_missing_beside_a_file_that_is_up_to_date_is_drawn(sagemp, made_up, command):
     assert sagemp("run", "--until", "verify").exit_code == 0
