@@ -6,7 +6,7 @@ Mutants are bytes flipped, files cut off, and changes that know the format: ever
 other types, shapes and values, links and data in other files, texts that are none, JSON and YAML edited; half of them
 with the hashes renewed, their own and those that later files have of them. Each is given to the commands that read
 such a file, many in one process (imports cost more than a mutant). A command has to end with a documented exit code
-within 60 s and 2 GiB, must not say what is in a file beside the mutant, and never with an internal error. The process
+within 60 s of processor time and 2 GiB, must not say what is in a file beside the mutant, and never with an internal error. The process
 is watched: one that hangs is ended, noted and replaced. One line of JSON for each command that failed, and a summary
 at the end; exit code 1 if there was a finding.
 """
@@ -117,7 +117,7 @@ def watch(folder: Path, seed: int, end: int, tally: Tally, out: TextIO) -> int:
             tally.add(line)
             if line["wrong"]:
                 note(line)
-        ended, hangs = process.poll() is not None, time.monotonic() - heard > 3 * SECONDS
+        ended, hangs = process.poll() is not None, time.monotonic() - heard > 10 * SECONDS
         if ended and not part and process.returncode == 0:
             return end
         if (ended and not part) or hangs:
@@ -167,9 +167,9 @@ def work(folder: Path, seeds: range) -> None:
             print(json.dumps({"what": "begin", **about}), flush=True)
             with open("/proc/self/clear_refs", "w") as file:
                 file.write("5")
-            began = time.monotonic()
+            began = time.process_time()
             result = runner.invoke(app, arguments, prog_name="sagemp")
-            seconds, memory = time.monotonic() - began, most_memory()
+            seconds, memory = time.process_time() - began, most_memory()  # busy machines wait
             said = result.output + str(getattr(result, "stderr", ""))
             wrong = [
                 *(["exit code"] if result.exit_code not in CODES else []),

@@ -21,10 +21,10 @@ RIGHT = {"state_dim": 4, "control_dim": 2, "lookahead": 3, "hidden": [4, 4], "ne
     [
         (RIGHT | {"hidden": [10**8, 10**8]}, "needs more than 1024 MiB of memory"),
         (RIGHT | {"hidden": [1] * 101}, "'hidden' has 101 numbers, more than 100"),
-        (RIGHT | {"negative_slope": []}, r"tracker.negative_slope must be float, found \[\]"),
+        (RIGHT | {"negative_slope": []}, r"tracker.negative_slope must be a number in \[0, 1\), found \[\]"),
         (RIGHT | {"hidden": "ab"}, "tracker.hidden must be"),
-        (RIGHT | {"lookahead": 10**40}, "tracker: "),
-        (RIGHT | {"state_dim": -4}, "tracker: "),
+        (RIGHT | {"lookahead": 10**40}, "tracker"),
+        (RIGHT | {"state_dim": -4}, "tracker.state_dim must be"),
         ({"hidden": [4]}, "Tracker needs state_dim, control_dim, lookahead"),
         (RIGHT | {"size": 3}, "tracker.size: Tracker has no such option"),
         ([], "must be a mapping"),
