@@ -6,7 +6,7 @@ Mutants are bytes flipped, files cut off, and changes that know the format: ever
 other types, shapes and values, links and data in other files, texts that are none, JSON and YAML edited; half of them
 with the hashes renewed, their own and those that later files have of them. Each is given to the commands that read
 such a file, many in one process (imports cost more than a mutant). A command has to end with a documented exit code
-within 60 s of processor time and 2 GiB, must not say what is in a file beside the mutant, and never with an internal error. The process
+within 60 s of processor time and 2 GiB, and must not say what is in a file beside the mutant. The process
 is watched: one that hangs is ended, noted and replaced. One line of JSON for each command that failed, and a summary
 at the end; exit code 1 if there was a finding.
 """
