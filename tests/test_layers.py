@@ -14,7 +14,7 @@ LAYERS = (
     ("config",),
     ("sets", "storage"),
     ("dynamics", "scenes", "learning"),
-    ("loop",),
+    ("loop", "problem"),
     ("reachability",),
     ("verification", "planners", "experts", "identification", "trackers"),
     ("library", "checker"),

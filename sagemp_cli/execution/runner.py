@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import random_disturbances, worst_case_disturbances
 from sagemp_cli.library.closest import closest_reference
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.verification import Verification
 
@@ -53,9 +52,8 @@ def execute_queries(
     library: Verification,
     propose: Callable[[Tensor], Tensor],
     *,
-    dynamics: Dynamics,
+    problem: Problem,
     tracker: Tracker,
-    scene: Scene,
     starts: Tensor,
     rollouts: int,
     generator: torch.Generator,
@@ -69,9 +67,8 @@ def execute_queries(
     Args:
         library: certified references with their tubes and start boxes.
         propose: the planner, ``propose(starts (Q, n)) -> references (Q, K+1, n)``.
-        dynamics: the robot.
+        problem: the robot, and the scene to judge the rollouts by, independently of the tubes.
         tracker: the policy that the library was certified with.
-        scene: to judge the rollouts, independently of the tubes.
         starts: measured starts ``(Q, n)``.
         rollouts: M, rollouts per query.
         generator: randomness of the disturbances.
@@ -99,7 +96,7 @@ def execute_queries(
     parts: list[tuple[Tensor, ...]] = []
     with (progress or Silent()).task("executing", len(starts)) as task:
         for q, i in enumerate(chosen.tolist()):
-            loop = ClosedLoop(dynamics, tracker, library.references[i])
+            loop = ClosedLoop(problem.dynamics, tracker, library.references[i])
             x = starts[q].expand(rollouts, -1)
             w = random_disturbances(library.disturbance, calm, horizon=horizon, generator=generator)
             if rollouts > calm:
@@ -108,8 +105,8 @@ def execute_queries(
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)
             cells, tubes = library.cells_of(i)
-            clear = (scene.signed_distance(states[..., list(dynamics.position)]) > 0).all(-1)
-            safe = clear & scene.goal.contains(states[:, -1])
+            clear = (problem.scene.signed_distance(states[..., list(problem.dynamics.position)]) > 0).all(-1)
+            safe = clear & problem.scene.goal.contains(states[:, -1])
             parts.append((torch.full((rollouts,), q), states, controls, w, inside_tube(states, cells, tubes), safe))
             task.advance()
     query, states, controls, disturbances, in_tube, safe = (torch.cat(p) for p in zip(*parts, strict=True))

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.inverse import Inverse, invert
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import Loop, random_disturbances, worst_case_disturbances
 from sagemp_cli.execution.open_loop import OpenLoop
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.scenes.scene import Scene
-from sagemp_cli.sets import Box
 from sagemp_cli.verification.attack.refutation import SoundnessError
 
 DISTURBANCES = ("none", "random", "worst case")
@@ -66,12 +64,9 @@ class SafetyTrials:
 
 def try_references(
     references: Tensor,
+    problem: Problem,
     *,
-    dynamics: Dynamics,
     tracker: Tracker,
-    scene: Scene,
-    start: Box,
-    disturbance: Box,
     rollouts: int,
     generator: torch.Generator,
     within_limits: bool = True,
@@ -86,11 +81,8 @@ def try_references(
 
     Args:
         references: ``(R, K+1, n)``.
-        dynamics: the robot.
+        problem: robot, scene and sets, with X_I ``(n,)``.
         tracker: the policy; its controls are not clamped, as in the proof.
-        scene: safe set and goal.
-        start: X_I, ``(n,)``.
-        disturbance: W.
         rollouts: M, starts under each kind of disturbance.
         generator: randomness of starts and disturbances.
         within_limits: whether the recovered controls are clamped into the robot's limits.
@@ -102,6 +94,7 @@ def try_references(
     """
     if rollouts < 1:
         raise UsageError(f"rollouts must be positive, found {rollouts}")
+    dynamics, disturbance = problem.dynamics, problem.disturbance
     inverse = invert(dynamics.analytical, references, within_limits=within_limits)
     ways: tuple[Callable[[Tensor], Loop], ...] = (
         lambda r: OpenLoop(dynamics, inverse.controls[r]),
@@ -111,7 +104,7 @@ def try_references(
     with (progress or Silent()).task("executing references", len(references)) as task:
         for some in torch.arange(len(references)).split(at_once):
             r = some.repeat_interleave(rollouts)
-            x = start.sample(len(r), generator)
+            x = problem.start.sample(len(r), generator)
             random = random_disturbances(disturbance, len(r), horizon=references.shape[1] - 1, generator=generator)
             for way, trials in zip(ways, found, strict=True):
                 loop = way(r)
@@ -119,7 +112,7 @@ def try_references(
                 with torch.no_grad():
                     rolled = [loop.rollout(x, w)[0] for w in (disturbance.center.expand_as(random), random, harm)]
                 states = torch.stack([part.unflatten(0, (len(some), rollouts)) for part in rolled], 1)
-                trials.append(_judged(states, scene, dynamics.position))
+                trials.append(_judged(states, problem))
             task.advance(len(some))
     open_loop, closed_loop = (
         Trials(*(torch.cat([getattr(t, name) for t in trials]) for name in ("clearance", "reached", "nearest")))
@@ -146,11 +139,11 @@ def require_certified_safe(certified: Sequence[int], trials: Trials) -> None:
             )
 
 
-def _judged(states: Tensor, scene: Scene, position: Sequence[int]) -> Trials:
+def _judged(states: Tensor, problem: Problem) -> Trials:
     """Of rollouts ``(R, D, M, K+1, n)``."""
-    distance = scene.signed_distance(states[..., list(position)]).amin(-1)
+    distance = problem.scene.signed_distance(states[..., list(problem.dynamics.position)]).amin(-1)
     finite = torch.isfinite(states).flatten(-2).all(-1)
     clearance = torch.where(finite, distance, -torch.inf)
     worst = clearance.argmin(-1)[..., None, None, None].expand(-1, -1, 1, *states.shape[-2:])
     nearest = states.gather(2, worst).squeeze(2)
-    return Trials(clearance, scene.goal.contains(states[..., -1, :]), nearest)
+    return Trials(clearance, problem.scene.goal.contains(states[..., -1, :]), nearest)

@@ -11,10 +11,10 @@ from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import robot_from
+from sagemp_cli.problem import Problem
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.storage import Artifact, DynamicsModel
-from sagemp_cli.verification.problem import Problem
 
 
 def trained_problem(context: StageContext) -> tuple[Problem, tuple[Artifact[DynamicsModel], ...]]:

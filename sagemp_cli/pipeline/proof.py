@@ -14,13 +14,13 @@ from sagemp_cli.config.binding import Binding, build
 from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.sets.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.verification.cells import CellProver, Pieces
 from sagemp_cli.verification.executors import Executor
 from sagemp_cli.verification.memory import cells_within, footprint
-from sagemp_cli.verification.problem import Problem
 from sagemp_cli.verification.verification import Verification, require_references, verify_references
 
 
@@ -92,16 +92,11 @@ class Proof:
         require_references(references, problem.dynamics)
         if steps != problem.horizon:
             raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
-        prover = CellProver(self.propagator, problem.dynamics, tracker, problem.disturbance)
-        found = footprint(prover, references[0], problem.start)
+        prover = CellProver(self.propagator, problem, tracker)
+        found = footprint(prover, references[0])
         return verify_references(
-            self.propagator,
-            problem.dynamics,
-            tracker=tracker,
-            scene=problem.scene,
-            references=references,
-            start=problem.start,
-            disturbance=problem.disturbance,
+            prover,
+            references,
             counts=self.counts,
             budget=self.budget,
             cells_at_once=cells_within(self.memory, self._most(len(references)), found, self.propagator),

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from annotated_types import Interval, doc
 
+from sagemp_cli.problem import Problem
 from sagemp_cli.sets import Box
-from sagemp_cli.verification.problem import Problem
 
 XIShare = Annotated[float, Interval(ge=0, le=1), doc("a share of X_I in [0, 1]")]
 

@@ -73,9 +73,8 @@ def run(context: StageContext) -> Path:
     )
     attack(
         made.certified,
-        problem.dynamics,
+        problem,
         tracker=tracker,
-        scene=problem.scene,
         generator=context.generator("build-library: falsifier"),
         progress=context.progress,
     )

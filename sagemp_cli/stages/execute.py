@@ -47,9 +47,8 @@ def run(context: StageContext) -> Path:
         lambda starts: planner.sample(
             starts, problem.scene.goal, scene=problem.scene, count=len(starts), generator=sampling
         ),
-        dynamics=problem.dynamics,
+        problem=problem,
         tracker=tracker,
-        scene=problem.scene,
         starts=problem.start.sample(section.queries, context.generator("execute: starts")),
         rollouts=section.rollouts,
         generator=context.generator("execute: disturbances"),

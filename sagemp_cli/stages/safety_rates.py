@@ -67,11 +67,8 @@ def run(context: StageContext) -> Path:
     )
     tried = try_references(
         references,
-        dynamics=problem.dynamics,
+        problem,
         tracker=tracker,
-        scene=problem.scene,
-        start=problem.start,
-        disturbance=problem.disturbance,
         rollouts=section.rollouts,
         generator=context.generator("safety-rates: rollouts"),
         within_limits=section.within_limits,

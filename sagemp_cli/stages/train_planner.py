@@ -29,10 +29,10 @@ from sagemp_cli.planners import (
     side_shares,
     train_planner,
 )
+from sagemp_cli.problem import Problem
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.planner import draw_planner
 from sagemp_cli.storage import Artifact, Parent, PlannerModel
-from sagemp_cli.verification.problem import Problem
 
 TRAJECTORIES = "trajectories"
 """Role of a file of trajectories among the planner's parents."""

@@ -24,10 +24,8 @@ from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.storage import Artifact, Certificate, Counterexample, Parent
 from sagemp_cli.verification.attack.falsifier import Counterexample as Found
-from sagemp_cli.verification.attack.refutation import attack, decided
+from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack, decided
 from sagemp_cli.verification.verdict import answer_of
-
-_GIVEN = ("verification", "dynamics", "tracker", "scene", "generator", "progress")
 
 
 @dataclass(frozen=True)
@@ -38,20 +36,19 @@ class Options:
         references: sampled from the planner, if there is no file; None: one, of a file's planner all.
         seed: of what is sampled.
         file: references to verify instead.
-        falsifier: options of :func:`~sagemp_cli.verification.attack.refutation.attack`.
+        falsifier: how hard the verdicts are attacked.
         true_model: options of :class:`~sagemp_cli.pipeline.true_model.TrueModelProof`.
     """
 
     references: Count | None
     seed: Whole
     file: str | None
-    falsifier: Mapping[str, Any] | None
+    falsifier: FalsifierOptions | None
     true_model: Mapping[str, Any] | None
 
 
 SECTIONS = (
     Binding("verify", Options),
-    Binding("verify.falsifier", attack, given=_GIVEN),
     TRUE_MODEL,
 )
 
@@ -85,12 +82,11 @@ def run(context: StageContext) -> Path:
     verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     refutation = attack(
         verification,
-        problem.dynamics,
+        problem,
         tracker=tracker,
-        scene=problem.scene,
         generator=context.generator("verify: falsifier"),
+        options=section.falsifier,
         progress=context.progress,
-        **SECTIONS[1].options(context.config),
     )
     for r, example in refutation.unproved:
         context.progress.say(

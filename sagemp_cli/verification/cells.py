@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
@@ -172,19 +172,17 @@ class CellProver:
 
     Attributes:
         propagator: bounds the loop.
-        dynamics: the robot.
+        problem: what is proved.
         tracker: the policy.
-        disturbance: W, ``(d,)``.
     """
 
     propagator: Propagator
-    dynamics: Dynamics
+    problem: Problem
     tracker: Tracker
-    disturbance: Box
 
     def prove(self, chunk: Chunk) -> CellTubes:
         """Bound states and controls of every cell, with one thread wherever it runs."""
-        loop = ClosedLoop(self.dynamics, self.tracker, chunk.references)
+        loop = ClosedLoop(self.problem.dynamics, self.tracker, chunk.references)
         began = time.perf_counter()
         with torch.no_grad(), one_thread():
             tube, u_lower, u_upper, recording = self._bound(loop, chunk.cells)
@@ -200,12 +198,12 @@ class CellProver:
         """As much as the propagator offers: a tube, bounds of the controls, the relaxations."""
         prove = getattr(self.propagator, "prove", None)
         if prove is not None:
-            return prove(loop, start, self.disturbance)
+            return prove(loop, start, self.problem.disturbance)
         with_controls = getattr(self.propagator, "propagate_with_controls", None)
         if with_controls is not None:
-            return *with_controls(loop, start, self.disturbance), None
-        tube = self.propagator.propagate(loop, start, self.disturbance)
-        unknown = torch.full((*tube.lower.shape[:-2], loop.horizon, self.dynamics.control_dim), torch.inf)
+            return *with_controls(loop, start, self.problem.disturbance), None
+        tube = self.propagator.propagate(loop, start, self.problem.disturbance)
+        unknown = torch.full((*tube.lower.shape[:-2], loop.horizon, loop.dynamics.control_dim), torch.inf)
         return tube, -unknown.double(), unknown.double(), None
 
 

@@ -43,8 +43,8 @@ class Footprint:
 
 
 @torch.no_grad()
-def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
-    """What one cell of a reference ``(K+1, n)`` takes; ``start (n,)`` is any of its start boxes.
+def footprint(prover: CellProver, reference: Tensor) -> Footprint:
+    """What one cell of a reference ``(K+1, n)`` takes.
 
     With n states, d disturbances, M generators at the last step, E entries of nonlinear operations a step (H of the
     widest one) and v = n + d + E variables a step, in numbers of 8 bytes:
@@ -55,11 +55,11 @@ def footprint(prover: CellProver, reference: Tensor, start: Box) -> Footprint:
     - of ``crown`` and ``best``: as ``affine``, ``K (3 v^2 + 2 v n)`` for the steps and ``6 rows v`` for the sweep;
     - of ``interval``: ``40 v + 2 kept``.
     """
-    propagator, steps, n, d = prover.propagator, len(reference) - 1, start.dim, prover.disturbance.dim
+    propagator, problem = prover.propagator, prover.problem
+    steps, n, d = len(reference) - 1, problem.dynamics.state_dim, problem.disturbance.dim
     shown = prover if hasattr(propagator, "prove") else dataclasses.replace(prover, propagator=Affine())
-    first = Chunk(
-        0, torch.zeros(1, dtype=torch.int64), reference[None, :2], Box(start.center[None], start.center[None])
-    )
+    middle = problem.start.center.reshape(-1, n)[:1]
+    first = Chunk(0, torch.zeros(1, dtype=torch.int64), reference[None, :2], Box(middle, middle))
     found = shown.prove(first)
     assert found.recording is not None
     entries, widest = found.recording.slope.shape[-1], max(found.recording.widths, default=1)

@@ -18,11 +18,8 @@ from torch import Tensor
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import partition, uncertain_dimensions
 from sagemp_cli.verification.adaptive import adaptive_cells
@@ -157,14 +154,9 @@ def require_finite(references: Tensor, state_names: Sequence[str]) -> None:
 
 
 def verify_references(
-    propagator: Propagator,
-    dynamics: Dynamics,
-    *,
-    tracker: Tracker,
-    scene: Scene,
+    prover: CellProver,
     references: Tensor,
-    start: Box,
-    disturbance: Box,
+    *,
     counts: Sequence[int] | None,
     budget: int = 1,
     cells_at_once: int = 128,
@@ -175,13 +167,8 @@ def verify_references(
     """Tubes and verdicts of references under one tracker.
 
     Args:
-        propagator: bounds the loop.
-        dynamics: the robot.
-        tracker: the policy.
-        scene: safe set and goal.
+        prover: problem, tracker and propagator; X_I is one box ``(n,)`` for all references or one each ``(R, n)``.
         references: ``(R, K+1, n)``, taken as exact numbers.
-        start: X_I, one box ``(n,)`` for all or one each ``(R, n)``.
-        disturbance: W, ``(d,)``.
         counts: cells per uncertain start dimension, see :func:`~sagemp_cli.sets.partition.partition`; None for
             an adaptive partition, see :mod:`sagemp_cli.verification.adaptive`.
         budget: cells of one reference at most, in an adaptive partition.
@@ -194,11 +181,12 @@ def verify_references(
         NonFiniteError: a reference contains NaN or infinity.
         UsageError: shapes that do not fit, or no references.
     """
+    problem, propagator = prover.problem, prover.propagator
+    dynamics, scene = problem.dynamics, problem.scene
     require_references(references, dynamics)
     count, n = references.shape[0], dynamics.state_dim
     references = references.to(torch.float64)
-    start = Box(start.lower.expand(count, n), start.upper.expand(count, n))
-    prover = CellProver(propagator, dynamics, tracker, disturbance)
+    start = Box(problem.start.lower.expand(count, n), problem.start.upper.expand(count, n))
     with (executor or Serial()).opened(prover) as run:
         work = _Work(run, references, cells_at_once, pieces, progress or Silent())
         if counts is None:
@@ -207,7 +195,7 @@ def verify_references(
                 start,
                 budget=budget,
                 shortfall=lambda tube: shortfall(tube, scene, position=dynamics.position),
-                hopeless=lambda owner, cells: _breaks(prover, scene, references[owner], cells),
+                hopeless=lambda owner, cells: _breaks(prover, references[owner], cells),
             )
         else:
             cells = partition(start, counts)
@@ -224,7 +212,7 @@ def verify_references(
     return Verification(
         references=references,
         start=start,
-        disturbance=disturbance,
+        disturbance=problem.disturbance,
         cell_reference=found.cell_reference,
         cells=found.cells,
         tube=found.tube,
@@ -274,18 +262,19 @@ class _Work:
         return joined
 
 
-def _breaks(prover: CellProver, scene: Scene, references: Tensor, cells: Box) -> Tensor:
+def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
     """Whether a rollout from the centre or a vertex of each cell leaves the safe set or misses the goal, ``(B,)``.
 
     Simulated under the middle disturbance. It is no proof (rounding), and only decides whether to go on splitting.
     """
     x = torch.stack([cells.center, *_vertices(cells)])
-    loop = ClosedLoop(prover.dynamics, prover.tracker, references)
-    w = prover.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
+    problem = prover.problem
+    loop = ClosedLoop(problem.dynamics, prover.tracker, references)
+    w = problem.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
         states, _ = loop.rollout(x, w)
-    clear = scene.signed_distance(states[..., list(prover.dynamics.position)]) > 0
-    return (~(clear.all(-1) & scene.goal.contains(states[..., -1, :]))).any(0)
+    clear = problem.scene.signed_distance(states[..., list(problem.dynamics.position)]) > 0
+    return (~(clear.all(-1) & problem.scene.goal.contains(states[..., -1, :]))).any(0)
 
 
 def _vertices(cells: Box) -> list[Tensor]:

@@ -16,12 +16,13 @@ from sagemp_cli.config.binding import target_class
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.pipeline.models import weights_of
 from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.storage import Certificate, Header, Tubes, write_artifact
 from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
-from sagemp_cli.verification.problem import Problem
+from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verification import verify_references
 
 LIMITS = {"unicycle": (4, 2), "planar_quadrotor": (6, 2), "quadrotor": (12, 4)}
@@ -130,14 +131,7 @@ def make_case(
     reference = problem.start.center + steps * velocity
     references = [reference] if not side else [reference, reference + torch.eye(n, dtype=torch.float64)[1] * side]
     verification = verify_references(
-        propagator or Affine(),
-        problem.dynamics,
-        tracker=tracker,
-        scene=problem.scene,
-        references=torch.stack(references),
-        start=problem.start,
-        disturbance=problem.disturbance,
-        counts=list(counts),
+        CellProver(propagator or Affine(), problem, tracker), torch.stack(references), counts=list(counts)
     )
     return Case(config, problem, tracker, arguments, tubes_record(verification))
 

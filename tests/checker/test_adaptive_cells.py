@@ -10,6 +10,7 @@ from sagemp_cli.checker.check import check
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes.scene import scene_from_mapping
+from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verification import verify_references
 
 
@@ -19,17 +20,9 @@ def test_an_adaptive_partition_is_proved_and_one_with_a_gap_is_not(make, mutate,
     goal = config["scene"]["goal"] = {"lower": [-9.0] * 4, "upper": [9.0] * 4}
 
     def verify(counts):
-        return verify_references(
-            Affine(),
-            case.problem.dynamics,
-            tracker=case.tracker,
-            scene=scene_from_mapping(config["scene"], state_dim=4, position_dim=2),
-            references=torch.from_numpy(case.tubes.references),
-            start=case.problem.start,
-            disturbance=case.problem.disturbance,
-            counts=counts,
-            budget=40,
-        )
+        scene = scene_from_mapping(config["scene"], state_dim=4, position_dim=2)
+        prover = CellProver(Affine(), dataclasses.replace(case.problem, scene=scene), case.tracker)
+        return verify_references(prover, torch.from_numpy(case.tubes.references), counts=counts, budget=40)
 
     coarse, fine = (float(verify(c).tube.upper[:, -1, 2].max()) for c in ([1, 1], [4, 4]))
     goal["upper"][2] = 0.1 * coarse + 0.9 * fine  # what one cell misses and small ones reach

@@ -14,6 +14,7 @@ from sagemp_cli.pipeline.models import weights_of
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import TrueModel
+from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.deviation import Folded, split
 from sagemp_cli.verification.verification import verify_references
 
@@ -25,17 +26,12 @@ def write(case):
     """``write(path, robot, section)`` writes the certificate of the small unicycle case with a learned robot."""
 
     def write(path, robot, section):
-        problem = case.problem
-        arguments = {
-            "tracker": case.tracker,
-            "scene": problem.scene,
-            "references": torch.from_numpy(case.tubes.references),
-            "start": problem.start,
-            "disturbance": problem.disturbance,
-            "counts": [2, 1],
-        }
-        own = verify_references(Affine(), robot, **arguments)
-        true, deviation = split(verify_references(Folded(Affine()), robot, **arguments), 2)
+        problem, references = dataclasses.replace(case.problem, dynamics=robot), torch.from_numpy(case.tubes.references)
+        own, true = (
+            verify_references(CellProver(propagator, problem, case.tracker), references, counts=[2, 1])
+            for propagator in (Affine(), Folded(Affine()))
+        )
+        true, deviation = split(true, 2)
         learned = dataclasses.replace(case, config=case.config | {"dynamics": section}, tubes=tubes_record(own))
         record = TrueModel(tubes=tubes_record(true), deviation=deviation.numpy())
         return learned.write(path, dynamics=weights_of(robot), true_model=record)

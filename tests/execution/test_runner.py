@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 
@@ -6,10 +8,12 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.execution import execute_queries, inside_tube, random_disturbances, worst_case_disturbances
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.verification.attack.refutation import SoundnessError, attack
+from sagemp_cli.verification.attack.refutation import FalsifierOptions, SoundnessError, attack
+from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verdict import Outcome, Verdict
 from sagemp_cli.verification.verification import verify_references
 
@@ -57,18 +61,13 @@ def plans(*heights):
     return torch.stack([torch.stack([x, h * torch.sin(1.5 * x)], -1) for h in heights])
 
 
+def problem(cart, **changes):
+    return dataclasses.replace(Problem(cart, SCENE, START, W, K), **changes)
+
+
 @pytest.fixture
 def library(cart, tracker):
-    found = verify_references(
-        Affine(),
-        cart,
-        tracker=tracker,
-        scene=SCENE,
-        references=plans(0.0, -0.6),
-        start=START,
-        disturbance=W,
-        counts=[2, 2],
-    )
+    found = verify_references(CellProver(Affine(), problem(cart), tracker), plans(0.0, -0.6), counts=[2, 2])
     assert [v.outcome for v in found.verdicts] == [Outcome.SAFE, Outcome.SAFE]
     return found
 
@@ -77,9 +76,8 @@ def run(library, cart, tracker, *, starts, propose, rollouts=40):
     return execute_queries(
         library,
         propose,
-        dynamics=cart,
+        problem=problem(cart),
         tracker=tracker,
-        scene=SCENE,
         starts=starts,
         rollouts=rollouts,
         generator=torch.Generator().manual_seed(1),
@@ -111,15 +109,9 @@ def test_a_start_outside_every_certified_box_is_refused(library, cart, tracker):
 
 def test_only_references_whose_start_box_contains_the_start_are_eligible(library, cart, tracker):
     shift = torch.tensor([[0.0, 0.0], [0.0, -0.4]])
+    starts = Box(START.lower + shift, START.upper + shift)
     moved = verify_references(
-        Affine(),
-        cart,
-        tracker=tracker,
-        scene=SCENE,
-        references=plans(0.0, -0.6),
-        start=Box(START.lower + shift, START.upper + shift),
-        disturbance=W,
-        counts=[2, 2],
+        CellProver(Affine(), problem(cart, start=starts), tracker), plans(0.0, -0.6), counts=[2, 2]
     )
     starts = torch.tensor([[0.0, 0.2], [0.0, -0.2]], dtype=torch.float64)
     done = run(moved, cart, tracker, starts=starts, propose=lambda s: plans(-0.6, -0.6), rollouts=2)
@@ -162,18 +154,10 @@ def test_a_rollout_that_leaves_one_of_its_cells_is_not_inside():
 
 
 def test_an_attack_refutes_what_is_unsafe_and_certified_references_withstand(library, cart, tracker):
-    crash = verify_references(
-        Affine(),
-        cart,
-        tracker=tracker,
-        scene=SCENE,
-        references=plans(0.0, 0.9),
-        start=START,
-        disturbance=W,
-        counts=[1, 1],
-    )
+    crash = verify_references(CellProver(Affine(), problem(cart), tracker), plans(0.0, 0.9), counts=[1, 1])
     assert [str(v.outcome) for v in crash.verdicts] == ["SAFE", "MAY_COLLIDE"]
-    found = attack(crash, cart, tracker=tracker, scene=SCENE, generator=torch.Generator().manual_seed(0), restarts=4)
+    options, generator = FalsifierOptions(restarts=4), torch.Generator().manual_seed(0)
+    found = attack(crash, problem(cart), tracker=tracker, generator=generator, options=options)
     assert [str(v.outcome) for v in found.verification.verdicts] == ["SAFE", "UNSAFE"]
     ((index, example),) = found.counterexamples
     assert (index, example.kind, example.name) == (1, "obstacle", "disc")
@@ -186,4 +170,4 @@ def test_a_certified_reference_that_is_refuted_is_an_internal_error(library, car
     with pytest.raises(
         SoundnessError, match="certified by 'affine', but a replayed rollout breaks 'goal px' at step 20"
     ):
-        attack(library, cart, tracker=tracker, scene=narrow, generator=torch.Generator().manual_seed(0))
+        attack(library, problem(cart, scene=narrow), tracker=tracker, generator=torch.Generator().manual_seed(0))

@@ -11,6 +11,7 @@ from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.execution import DISTURBANCES, OpenLoop, Trials, require_certified_safe, try_references
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.attack.refutation import SoundnessError
@@ -66,9 +67,9 @@ def plans(*heights):
 
 
 def tried(tracker, references, *, robot=None, **changes):
-    options = {"scene": SCENE, "start": START, "disturbance": W, "rollouts": 12} | changes
-    generator = torch.Generator().manual_seed(3)
-    return try_references(references, dynamics=robot or cart(), tracker=tracker, generator=generator, **options)
+    problem = Problem(robot or cart(), SCENE, START, W, K)
+    options = {"rollouts": 12, "generator": torch.Generator().manual_seed(3)} | changes
+    return try_references(references, problem, tracker=tracker, **options)
 
 
 def test_an_open_loop_keeps_its_start_error_and_adds_up_the_disturbances():

@@ -149,7 +149,7 @@ def test_an_input_of_another_config_is_refused(work):
         ("train-tracker", "+tracker_training.lr=1", "tracker_training.lr: train_tracker has no such option"),
         ("verify", "proof.partitions=0", "partitions must be a positive number of cells in all"),
         ("verify", "verify.references=0", "verify.references must be a whole number"),
-        ("verify", "+verify.falsifier.steps=3", r"verify.falsifier.steps: attack has no such option"),
+        ("verify", "+verify.falsifier.steps=3", r"verify.falsifier.steps: no such option"),
         ("build-library", "library.budget=1", "library.budget must be at least library.size, 2; found 1"),
         ("build-library", "library.start_spread=2.0", "library.start_spread must be a share of X_I"),
         ("execute", "execute.rollouts=0", "execute.rollouts must be a whole number of at least 1, found 0"),

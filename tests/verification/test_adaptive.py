@@ -7,11 +7,12 @@ from sagemp_cli.checker.cover import covered
 from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.adaptive import adaptive_cells
-from sagemp_cli.verification.cells import CellTubes
+from sagemp_cli.verification.cells import CellProver, CellTubes
 from sagemp_cli.verification.verdict import Outcome
 from sagemp_cli.verification.verification import verify_references
 
@@ -127,17 +128,9 @@ def adaptive():
     shift = torch.tensor([[0.0] * 4, [0.0, -0.5, 0.0, 0.0], [0.0, 1.5, 0.0, 0.0]])
 
     def verify(counts, scene=SCENE, **options):
-        return verify_references(
-            Affine(),
-            unicycle,
-            tracker=tracker,
-            scene=scene,
-            references=references,
-            start=Box(start.lower + shift, start.upper + shift),
-            disturbance=Box.around([0.0] * 4, [0.02, 0.02, 0.0, 0.02]),
-            counts=counts,
-            **options,
-        )
+        starts = Box(start.lower + shift, start.upper + shift)
+        problem = Problem(unicycle, scene, starts, Box.around([0.0] * 4, [0.02, 0.02, 0.0, 0.02]), K)
+        return verify_references(CellProver(Affine(), problem, tracker), references, counts=counts, **options)
 
     return unicycle, tracker, verify
 

@@ -9,8 +9,10 @@ import torch
 from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import ResourceError
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
+from sagemp_cli.scenes import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellProver, Chunk
 from sagemp_cli.verification.deviation import Folded
@@ -25,12 +27,16 @@ from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.verification.memory import footprint
 from sagemp_cli.verification.cells import CellProver, Chunk
 from sagemp_cli.sets import Box
+from sagemp_cli.scenes import Scene
+from sagemp_cli.problem import Problem
 from sagemp_cli.loop.tracker import Tracker
 
 limits = dict(control_lower=[-9.0] * 2, control_upper=[9.0] * 2, state_lower=[-9.0] * 6, state_upper=[9.0] * 6)
 torch.manual_seed(0)
 tracker = Tracker(state_dim=6, control_dim=2, lookahead=3, hidden=[16, 16], control_scale=[0.01] * 2)
-prover = CellProver(Affine(), PlanarQuadrotor(dt=0.01, **limits), tracker, Box.around([0.0] * 6, [0.01] * 6))
+box = Box.around([0.0] * 6, [0.01] * 6)
+scene = Scene(Box([-9.0] * 2, [9.0] * 2), (), Box([-9.0] * 6, [9.0] * 6))
+prover = CellProver(Affine(), Problem(PlanarQuadrotor(dt=0.01, **limits), scene, box, box, 40), tracker)
 
 def prove(cells, rows):
     reference = torch.zeros(cells, rows, 6, dtype=torch.float64)
@@ -42,7 +48,7 @@ def peak():
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 prove(1, 4)
-found = footprint(prover, torch.zeros(41, 6, dtype=torch.float64), Box.around([0.0] * 6, [0.01] * 6))
+found = footprint(prover, torch.zeros(41, 6, dtype=torch.float64))
 before = peak()
 tubes = prove(64, 41)
 kept = sum(array.nbytes for name, array in tubes.arrays().items() if not name.startswith("cell"))
@@ -63,21 +69,24 @@ def prover(propagator, hidden=8):
     limits = {"control_lower": [-1.5, -2.0], "control_upper": [1.5, 2.0]}
     unicycle = Unicycle(dt=0.1, state_lower=[-3.0, -4.0, -1.6, 0.0], state_upper=[9.0, 4.0, 1.6, 3.0], **limits)
     tracker = Tracker(state_dim=4, control_dim=2, lookahead=3, hidden=[hidden, hidden])
-    return CellProver(propagator, unicycle, tracker, Box.around([0.0] * 4, [0.05, 0.05, 0.0, 0.02]))
+    w = Box.around([0.0] * 4, [0.05, 0.05, 0.0, 0.02])
+    scene = Scene(Box([-9.0] * 2, [9.0] * 2), (), Box([-9.0] * 4, [9.0] * 4))
+    return CellProver(propagator, Problem(unicycle, scene, START, w, 50), tracker)
 
 
 START = Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.3, 0.0, 0.0])
 
 
 def needs(propagator, steps=50):
-    return footprint(prover(propagator), torch.zeros(steps + 1, 4, dtype=torch.float64), START)
+    return footprint(prover(propagator), torch.zeros(steps + 1, 4, dtype=torch.float64))
 
 
 def test_a_proof_about_a_learned_robots_model_counts_what_it_adds(learned_unicycle):
-    plain = dataclasses.replace(prover(Affine()), dynamics=learned_unicycle())
+    plain = prover(Affine())
+    plain = dataclasses.replace(plain, problem=dataclasses.replace(plain.problem, dynamics=learned_unicycle()))
     folded = dataclasses.replace(plain, propagator=Folded(Affine()))
     reference = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(11, 4)
-    network, model = (footprint(p, reference, START) for p in (plain, folded))
+    network, model = (footprint(p, reference) for p in (plain, folded))
     assert model.kept > 1.1 * network.kept and model.working > 1.1 * network.working
     cell = Box(START.lower[None], START.upper[None])
     tubes = folded.prove(Chunk(0, torch.zeros(1, dtype=torch.int64), reference[None], cell))
@@ -102,7 +111,7 @@ def test_what_is_kept_is_counted_as_if_no_generator_were_negligible(symbols, abo
     sizes = {name: array.nbytes for name, array in tubes.arrays().items()}
     for name in ("cell_reference", "cell_lower", "cell_upper", "seconds", "operations", "widths"):
         del sizes[name]
-    assert 0.98 * sum(sizes.values()) <= footprint(work, reference[0], START).kept <= above * sum(sizes.values())
+    assert 0.98 * sum(sizes.values()) <= footprint(work, reference[0]).kept <= above * sum(sizes.values())
 
 
 def test_as_many_cells_at_once_as_the_budget_allows():

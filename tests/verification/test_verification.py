@@ -7,9 +7,11 @@ from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verdict import Outcome
 from sagemp_cli.verification.verification import verify_references
 
@@ -54,13 +56,8 @@ def references(count):
 
 def prove(propagator, unicycle, tracker, refs, *, start=START, **options):
     return verify_references(
-        propagator,
-        unicycle,
-        tracker=tracker,
-        scene=SCENE,
-        references=refs,
-        start=start,
-        disturbance=W,
+        CellProver(propagator, Problem(unicycle, SCENE, start, W, K), tracker),
+        refs,
         counts=[2, 3],
         **options,
     )

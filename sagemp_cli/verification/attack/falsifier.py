@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.propagator import Loop
-from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.attack.ascent import ascend, first_units, simulate
 from sagemp_cli.verification.attack.rigorous_replay import inner, violations
@@ -49,12 +49,12 @@ class Counterexample:
     proved: bool = False
 
 
-def margins(states: Tensor, scene: Scene, position: tuple[int, ...]) -> Tensor:
+def margins(states: Tensor, problem: Problem) -> Tensor:
     """Signed margins ``(..., K+1, C)`` of states: [workspace, obstacles..., goal], broken if negative.
 
     The goal counts at step K only; earlier rows are infinite. Round to nearest.
     """
-    p = states[..., list(position)]
+    scene, p = problem.scene, states[..., list(problem.dynamics.position)]
     inside = torch.minimum(p - scene.workspace.lower, scene.workspace.upper - p).amin(-1)
     goal = torch.full_like(inside, torch.inf)
     last = states[..., -1, :]
@@ -63,34 +63,25 @@ def margins(states: Tensor, scene: Scene, position: tuple[int, ...]) -> Tensor:
     return torch.stack([inside, *(o.signed_distance(p) for o in scene.obstacles), goal], dim=-1)
 
 
-def replay(
-    loop: Loop,
-    start: Tensor,
-    disturbances: Tensor,
-    *,
-    boxes: tuple[Box, Box],
-    scene: Scene,
-    position: tuple[int, ...],
-) -> Counterexample | None:
+def replay(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Counterexample | None:
     """The counterexample that a start ``(n,)`` and disturbances ``(K, d)`` make alone, or None if float64 shows none.
 
-    Both are first moved into what the boxes hold whatever their corners were rounded from. A rollout that overflows
+    Both are first moved into what X_I and W hold whatever their corners were rounded from. A rollout that overflows
     is no counterexample.
 
     Args:
         loop: what steps.
         start, disturbances: the rollout.
-        boxes: X_I and W, which they come from.
-        scene: workspace, obstacles and goal.
-        position: indices of the state that are the position in the scene.
+        problem: what is claimed, with X_I ``(n,)``; the loop may be another one than that of its robot.
     """
-    start, disturbances = (_into(inner(box), point) for box, point in zip(boxes, (start, disturbances), strict=True))
+    start, disturbances = _into(inner(problem.start), start), _into(inner(problem.disturbance), disturbances)
+    scene = problem.scene
     with torch.no_grad():
         states = simulate(loop, start, disturbances)
-        found = margins(states, scene, position)
+        found = margins(states, problem)
     if not bool(torch.isfinite(states).all()) or not bool((found < 0).any()):
         return None
-    proved = violations(loop, start, disturbances, boxes=boxes, scene=scene, position=position)
+    proved = violations(loop, start, disturbances, problem)
     certain = bool(proved.any())
     # Of what is proved (of what float64 shows, if nothing is) the constraint that is broken most.
     broken = proved if certain else found < 0
@@ -109,11 +100,8 @@ def _into(box: Box, point: Tensor) -> Tensor:
 
 def falsify(
     loop: Loop,
-    start: Box,
-    disturbance: Box,
+    problem: Problem,
     *,
-    scene: Scene,
-    position: tuple[int, ...],
     generator: torch.Generator,
     restarts: int = 8,
     rates: tuple[float, ...] = (2.0, 1.0, 0.5, 0.5, 0.25, 0.25, 0.1, 0.1),
@@ -125,16 +113,15 @@ def falsify(
 
     Args:
         loop: one reference, or a :class:`~sagemp_cli.loop.closed_loop.ClosedLoop` with references ``(R, K+1, n)``.
-        start: ``(n,)``, or ``(R, n)`` with one box for each reference.
-        disturbance: ``(d,)``.
-        scene: workspace, obstacles and goal.
-        position: indices of the state that are the position in the scene.
+        problem: what is claimed, with X_I ``(n,)``, or ``(R, n)`` with one box for each reference; the loop may be
+            another one than that of its robot.
         generator: draws the restarts.
         restarts: ascents for each constraint.
         rates: see :func:`~sagemp_cli.verification.attack.ascent.ascend`.
     """
     if restarts < 1:
         raise UsageError(f"falsifier: restarts must be a positive integer, found {restarts}")
+    start, disturbance = problem.start, problem.disturbance
     if start.lower.dim() > 2:
         raise UsageError(f"falsifier: start must have shape (n,) or (R, n), found {tuple(start.lower.shape)}")
     batched = isinstance(loop, ClosedLoop) and loop.references.dim() > 2
@@ -143,7 +130,7 @@ def falsify(
         loop = dataclasses.replace(loop, references=loop.references[:, None])
     else:
         singles = [loop]
-    n, count, attacks = loop.state_dim, len(singles), len(scene.constraint_names) + 1
+    n, count, attacks = loop.state_dim, len(singles), len(problem.scene.constraint_names) + 1
     if start.lower.dim() == 2 and len(start.lower) != count:
         raise UsageError(f"falsifier: {len(start.lower)} start boxes for {count} references")
     boxes = Box(start.lower.expand(count, n)[:, None], start.upper.expand(count, n)[:, None])
@@ -153,7 +140,7 @@ def falsify(
     target = torch.arange(rows) % attacks
 
     def score(states: Tensor) -> Tensor:
-        least = margins(states, scene, position).amin(-2)
+        least = margins(states, problem).amin(-2)
         return -least.gather(-1, target.expand(count, rows)[..., None])[..., 0]
 
     x, w = first_units((count, restarts), loop.horizon, start, disturbance, generator)
@@ -168,16 +155,14 @@ def falsify(
         disturbance_unit=w.repeat_interleave(attacks, dim=1),
         rates=rates,
     ):
-        least = torch.nan_to_num(margins(trial.states, scene, position).flatten(-2).amin(-1), nan=torch.inf)
+        least = torch.nan_to_num(margins(trial.states, problem).flatten(-2).amin(-1), nan=torch.inf)
         value, row = least.min(-1)
         for r in torch.nonzero(value < worst.clamp(max=0.0))[:, 0].tolist():
             example = replay(
                 singles[r],
                 trial.start[r, row[r]].clone(),
                 trial.disturbances[r, row[r]].clone(),
-                boxes=(Box(boxes.lower[r, 0], boxes.upper[r, 0]), disturbance),
-                scene=scene,
-                position=position,
+                dataclasses.replace(problem, start=Box(boxes.lower[r, 0], boxes.upper[r, 0])),
             )
             if example is None:
                 continue

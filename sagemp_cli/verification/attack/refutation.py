@@ -11,8 +11,8 @@ from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
-from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.attack.falsifier import Counterexample, falsify
 from sagemp_cli.verification.verdict import Outcome, Verdict
@@ -20,6 +20,21 @@ from sagemp_cli.verification.verification import Verification
 
 RATES = (2.0, 1.0, 0.5, 0.5, 0.25, 0.25, 0.1, 0.1)
 SHORT_RATES = (2.0, 1.0, 0.5)
+
+
+@dataclass(frozen=True)
+class FalsifierOptions:
+    """How hard is searched for counterexamples.
+
+    Attributes:
+        restarts: ascents per constraint of a reference that is not certified; 0 leaves them alone.
+        safe_restarts: the same for certified ones.
+        at_once: references in one batch, which bounds the memory.
+    """
+
+    restarts: Whole = 16
+    safe_restarts: Whole = 2
+    at_once: Count = 4
 
 
 class SoundnessError(Exception):
@@ -45,47 +60,41 @@ class Refutation:
 
 def attack(
     verification: Verification,
-    dynamics: Dynamics,
+    problem: Problem,
     *,
     tracker: Tracker,
-    scene: Scene,
     generator: torch.Generator,
-    restarts: Whole = 16,
-    safe_restarts: Whole = 2,
-    at_once: Count = 4,
+    options: FalsifierOptions | None = None,
     progress: Progress | None = None,
 ) -> Refutation:
     """Search for counterexamples by gradient ascent on starts and disturbances.
 
-    References that are not SAFE get ``restarts`` ascents per constraint, certified ones a short attack of
-    ``safe_restarts`` as a guard against our own bugs. Finding nothing proves nothing.
+    References that are not SAFE get ``options.restarts`` ascents per constraint, certified ones a short attack of
+    ``options.safe_restarts`` as a guard against our own bugs. Finding nothing proves nothing.
 
     Args:
-        verification: what to attack.
-        dynamics, tracker, scene: what it speaks about.
+        verification: what to attack: the start boxes and W are its own.
+        problem, tracker: what it speaks about.
         generator: draws where the ascents begin.
-        restarts: ascents per constraint of a reference that is not certified; 0 leaves them alone.
-        safe_restarts: the same for certified ones.
-        at_once: references in one batch, which bounds the memory.
+        options: how hard.
         progress: reports references.
 
     Raises:
         SoundnessError: a certified reference was refuted.
     """
     verdicts, found, unproved, rollouts = list(verification.verdicts), [], [], 0
-    attacks = len(scene.constraint_names) + 1
+    options, dynamics = options or FalsifierOptions(), problem.dynamics
+    attacks = len(problem.scene.constraint_names) + 1
     with (progress or Silent()).task("searching for counterexamples", len(verdicts)) as task:
-        for safe, starts, rates in ((False, restarts, RATES), (True, safe_restarts, SHORT_RATES)):
+        for safe, starts, rates in ((False, options.restarts, RATES), (True, options.safe_restarts, SHORT_RATES)):
             targets = [r for r, v in enumerate(verification.verdicts) if (v.outcome is Outcome.SAFE) is safe]
-            for begin in range(0, len(targets), at_once):
-                some = targets[begin : begin + at_once]
+            for begin in range(0, len(targets), options.at_once):
+                some = targets[begin : begin + options.at_once]
                 if starts > 0:
+                    boxes = Box(verification.start.lower[some], verification.start.upper[some])
                     examples = falsify(
                         ClosedLoop(dynamics, tracker, verification.references[some]),
-                        Box(verification.start.lower[some], verification.start.upper[some]),
-                        verification.disturbance,
-                        scene=scene,
-                        position=dynamics.position,
+                        dataclasses.replace(problem, start=boxes, disturbance=verification.disturbance),
                         generator=generator,
                         restarts=starts,
                         rates=rates,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.propagator import Loop
-from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, round_down, round_up
 
 
@@ -51,15 +51,7 @@ def inner(box: Box) -> Box:
     return Box(torch.where(fits, low, box.lower), torch.where(fits, high, box.upper))
 
 
-def violations(
-    loop: Loop,
-    start: Tensor,
-    disturbances: Tensor,
-    *,
-    boxes: tuple[Box, Box],
-    scene: Scene,
-    position: tuple[int, ...],
-) -> Tensor:
+def violations(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Tensor:
     """Which constraint the rollout certainly breaks at which step, ``(K+1, C)``: [workspace, obstacles..., goal].
 
     Args:
@@ -67,18 +59,18 @@ def violations(
         start: ``(n,)``, in :func:`inner` of X_I. In a dimension so narrow that its inner points are not known the
             start is anywhere in it.
         disturbances: ``(K, d)``, in :func:`inner` of W; if W has so narrow a dimension, nothing is certain.
-        boxes: X_I and W.
-        scene: workspace, obstacles and goal.
-        position: indices of the state that are the position in the scene.
+        problem: what is claimed, with X_I ``(n,)``; the loop may be another one than that of its robot.
     """
-    loose, loose_w = (_unknown(box) for box in boxes)
+    scene, around = problem.scene, problem.start
+    loose, loose_w = _unknown(around), _unknown(problem.disturbance)
     rows, columns = loop.horizon + 1, len(scene.constraint_names) + 1
     if bool(loose_w.any()):
         return torch.zeros(rows, columns, dtype=torch.bool)
-    first = Box(torch.where(loose, boxes[0].lower, start), torch.where(loose, boxes[0].upper, start))
-    still = Box.around([0.0] * boxes[1].dim, [0.0] * boxes[1].dim)
+    first = Box(torch.where(loose, around.lower, start), torch.where(loose, around.upper, start))
+    still = Box.around([0.0] * problem.disturbance.dim, [0.0] * problem.disturbance.dim)
     tube = Affine().propagate(OneRollout(loop, disturbances), first, still)
-    p = Box(tube.lower[:, list(position)], tube.upper[:, list(position)])
+    position = list(problem.dynamics.position)
+    p = Box(tube.lower[:, position], tube.upper[:, position])
     outside = ((p.lower > scene.workspace.upper) | (p.upper < scene.workspace.lower)).any(-1)
     missed = torch.zeros(rows, dtype=torch.bool)
     missed[-1] = ((tube.lower[-1] > scene.goal.upper) | (tube.upper[-1] < scene.goal.lower)).any()

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from sagemp_cli.dynamics import Unicycle
+from sagemp_cli.dynamics import Dynamics, Unicycle
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.problem import Problem
 from sagemp_cli.scenes.scene import Ball, Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
@@ -32,6 +33,25 @@ class Drift:
         return x + torch.tensor([0.1, 0.0], dtype=torch.float64) + w
 
 
+class Point(Dynamics):
+    """The robot of these loops: of it only the position counts."""
+
+    state_names = ("px", "py")
+    state_units = ("m", "m")
+    control_names = ("vx", "vy")
+    control_units = ("m/s", "m/s")
+    position = (0, 1)
+
+    def derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        return u
+
+
+def claim(where: Scene, start: Box, disturbance: Box, horizon: int = 10) -> Problem:
+    sides = {"lower": [-9.0] * 2, "upper": [9.0] * 2}
+    limits = {f"{of}_{side}": value for of in ("state", "control") for side, value in sides.items()}
+    return Problem(Point(dt=0.1, **limits), where, start, disturbance, horizon)
+
+
 START = Box.around([0.0, 0.0], [0.1, 0.1])
 DISTURBANCE = Box.around([0.0, 0.0], [0.02, 0.02])
 
@@ -43,7 +63,7 @@ def scene(*obstacles: Ball, goal=((-INF, -INF), (INF, INF)), half: float = 5.0) 
 
 def search(where: Scene, loop=None, start=START, **options):
     generator = torch.Generator().manual_seed(0)
-    return falsify(loop or Drift(), start, DISTURBANCE, scene=where, position=(0, 1), generator=generator, **options)
+    return falsify(loop or Drift(), claim(where, start, DISTURBANCE), generator=generator, **options)
 
 
 def test_a_violation_that_only_the_worst_disturbance_reaches_is_found_and_replays():
@@ -107,9 +127,7 @@ def test_a_goal_that_real_arithmetic_reaches_is_not_called_missed_though_float64
     lower = math.nextafter(float(real), -INF)
     assert Fraction(lower) < real - Fraction(1, 10**12)  # X_I is 2e-12 wide: the goal is reached from all of it
     start, still = Box.around([at, 0.0], [1e-12, 0.0]), Box.around([0.0, 0.0], [0.0, 0.0])
-    [found] = falsify(
-        loop, start, still, scene=goal_from(lower), position=(0, 1), generator=torch.Generator().manual_seed(0)
-    )
+    [found] = falsify(loop, claim(goal_from(lower), start, still), generator=torch.Generator().manual_seed(0))
     assert found is None or not found.proved
     assert (found is not None) == (min(end_in_float64(x, by, loop.horizon) for x in boundary(start)) < lower)
 
@@ -133,14 +151,8 @@ def test_a_goal_that_is_missed_by_more_than_rounding_is_proved_missed(at):
     loop, still = Along(), Box.around([0.0, 0.0], [0.0, 0.0])
     real = Fraction(at) + loop.horizon * Fraction(loop.by)
     lower = float(real) + 1e-14 * max(at, 1.0) * 100
-    [found] = falsify(
-        loop,
-        Box.around([at, 0.0], [1e-12, 0.0]),
-        still,
-        scene=goal_from(lower),
-        position=(0, 1),
-        generator=torch.Generator().manual_seed(0),
-    )
+    problem = claim(goal_from(lower), Box.around([at, 0.0], [1e-12, 0.0]), still)
+    [found] = falsify(loop, problem, generator=torch.Generator().manual_seed(0))
     assert found is not None and found.proved and (found.kind, found.state, found.step) == ("goal", 0, 100)
 
 
@@ -151,15 +163,8 @@ def test_a_goal_missed_by_1e_15_is_refuted_only_if_real_arithmetic_misses_it():
     verdicts = {}
     for ulps in (-1000, -20, -9, -3, -1, 0, 1, 3, 9, 20, 1000):  # 9 of them are 1e-15
         lower = 0.6 + ulps * 2.0**-53
-        [found] = falsify(
-            loop,
-            Box.around([0.1, 0.0], [0.0, 1e-3]),
-            still,
-            scene=goal_from(lower),
-            position=(0, 1),
-            generator=torch.Generator().manual_seed(0),
-            restarts=1,
-        )
+        problem = claim(goal_from(lower), Box.around([0.1, 0.0], [0.0, 1e-3]), still)
+        [found] = falsify(loop, problem, generator=torch.Generator().manual_seed(0), restarts=1)
         verdicts[ulps] = found is not None and found.proved
         assert not verdicts[ulps] or real < Fraction(lower)
     assert verdicts[1000] and not verdicts[-1000]
@@ -176,32 +181,24 @@ def test_what_is_proved_starts_inside_the_real_box_and_not_in_the_float_outside_
     loop = Along(0.5, 1)
     lower = math.nextafter(float(real + Fraction(1, 2)), 0.0)
     assert Fraction(lower) <= real + Fraction(1, 2)
-    [found] = falsify(
-        loop,
-        start,
-        Box.around([0.0, 0.0], [0.0, 0.0]),
-        scene=goal_from(lower),
-        position=(0, 1),
-        generator=torch.Generator().manual_seed(0),
-    )
+    problem = claim(goal_from(lower), start, Box.around([0.0, 0.0], [0.0, 0.0]))
+    [found] = falsify(loop, problem, generator=torch.Generator().manual_seed(0))
     assert found is None or not found.proved
 
 
 def test_a_disturbance_set_too_narrow_to_know_its_points_proves_nothing():
     where, x, w = goal_from(1e9), torch.zeros(2, dtype=torch.float64), torch.zeros(100, 2, dtype=torch.float64)
     narrow = Box.around([5e6, 0.0], [1e-12, 0.0])
-    boxes = (Box.around([0.0, 0.0], [0.1, 0.1]), narrow)
-    assert not bool(violations(Along(), x, w + narrow.center, boxes=boxes, scene=where, position=(0, 1)).any())
-    boxes = (boxes[0], Box.around([0.0, 0.0], [0.1, 0.1]))
-    assert bool(violations(Along(), x, w, boxes=boxes, scene=where, position=(0, 1))[-1, -1])
+    wide = Box.around([0.0, 0.0], [0.1, 0.1])
+    assert not bool(violations(Along(), x, w + narrow.center, claim(where, wide, narrow)).any())
+    assert bool(violations(Along(), x, w, claim(where, wide, wide))[-1, -1])
 
 
 def test_a_rollout_that_breaks_nothing_is_no_counterexample():
-    boxes = (START, DISTURBANCE)
     still = torch.zeros(10, 2, dtype=torch.float64)
     x = torch.zeros(2, dtype=torch.float64)
-    assert replay(Drift(), x, still, boxes=boxes, scene=scene(), position=(0, 1)) is None
-    found = replay(Drift(), x, still, boxes=boxes, scene=scene(half=0.45), position=(0, 1))
+    assert replay(Drift(), x, still, claim(scene(), START, DISTURBANCE)) is None
+    found = replay(Drift(), x, still, claim(scene(half=0.45), START, DISTURBANCE))
     assert found is not None and found.proved and (found.kind, found.step) == ("workspace", 5)
 
 
@@ -234,10 +231,7 @@ def test_references_are_searched_together_and_answered_one_by_one():
     )
     found = falsify(
         ClosedLoop(dynamics, tracker, references),
-        starts,
-        Box.around([0.0] * 4, [0.01] * 4),
-        scene=where,
-        position=(0, 1),
+        Problem(dynamics, where, starts, Box.around([0.0] * 4, [0.01] * 4), 8),
         generator=torch.Generator().manual_seed(1),
     )
     assert found[0] is not None and found[0].name == "ahead"

@@ -10,6 +10,7 @@ import torch
 
 from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box
@@ -40,24 +41,23 @@ def small() -> Small:
     references[..., 3] = 1.0
     w = Box.around([0.0] * 4, [0.05, 0.05, 0.0, 0.02])
 
+    def prover_of(end):
+        goal = Box([-9.0] * 4, [end, 9.0, 9.0, 9.0])
+        scene = Scene(Box([-2.0, -2.0], [4.0, 2.0]), (Ball((1.0, 0.9), 0.2, "disc"),), goal)
+        start = Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.3, 0.0, 0.0])
+        return CellProver(Affine(), Problem(unicycle, scene, start, w, K), tracker)
+
     def verify(counts, end=9.0, **options):
         """``end`` is how far along x the goal extends."""
-        goal = Box([-9.0] * 4, [end, 9.0, 9.0, 9.0])
-
         return verify_references(
-            Affine(),
-            unicycle,
-            tracker=tracker,
-            scene=Scene(Box([-2.0, -2.0], [4.0, 2.0]), (Ball((1.0, 0.9), 0.2, "disc"),), goal),
-            references=references,
-            start=Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.3, 0.0, 0.0]),
-            disturbance=w,
+            prover_of(end),
+            references,
             counts=counts,
             cells_at_once=4,
             **options,
         )
 
-    return Small(CellProver(Affine(), unicycle, tracker, w), verify)
+    return Small(prover_of(9.0), verify)
 
 
 def assert_same_bits(a: Verification, b: Verification) -> None:

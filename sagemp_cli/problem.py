@@ -16,8 +16,8 @@ class Problem:
     Attributes:
         dynamics: the robot.
         scene: safe set and goal.
-        start: X_I, ``(n,)``.
-        disturbance: W, ``(n,)``.
+        start: X_I, ``(n,)``; ``(R, n)`` where each of R references has its own.
+        disturbance: W, ``(d,)``.
         horizon: number of steps K.
     """
 
