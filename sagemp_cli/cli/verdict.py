@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,14 @@ def exit_code(certificate: Artifact[Certificate]) -> int:
 def as_lines(certificate: Artifact[Certificate]) -> list[str]:
     """The verdict and what decided it, where the files are."""
     data = as_json(certificate)
-    what = f"experiment {data['experiment']}, K = {data['horizon']}, {data['propagator']}"
+    what = f"experiment {data['experiment']}, K = {data['horizon']}, at the samples, {data['propagator']}"
     cells = f"{data['cells']} cell{'s' * (data['cells'] != 1)}"
     counted = f"{data['certified']} of {len(data['references'])} references certified, {cells}"
     lines = [f"{data['verdict']}: {counted} ({what}{'' if data['rigorous'] else ', rounding not included'})"]
     for i, item in enumerate(data["references"]):
         if item["verdict"] == "SAFE":
             near = f", keeps {item['clearance']:.3g} m from {item['nearest']}" if item["nearest"] else ""
-            lines.append(f"  reference {i}: SAFE at all steps{near}")
+            lines.append(f"  reference {i}: SAFE at the samples{near}")
         else:
             lines.append(f"  reference {i}: {item['verdict']} at step {item['step']} ({item['constraint']})")
     if data["stand_in"]:
@@ -61,6 +62,9 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
         f" {c['depth']:.3g} deep"
         for c in data["counterexamples"]
     ]
+    if data["samples"] is not None:
+        s = data["samples"]
+        lines.append(f"  further plans of the planner: {s['certified']} of {s['drawn']} certify too (seed {s['seed']})")
     lines.append(f"certificate {data['certificate']}")
     if data["verdict"] == "VERIFIED" and not data["checkable"]:
         recorded = f"propagator '{data['propagator']}' records no relaxations, 'affine' does"
@@ -111,6 +115,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "exit_code": exit_code(certificate),
         "experiment": certificate.header.experiment,
         "stand_in": stand_in(certificate.header.config) or None,
+        "holds": "at the samples",
         "horizon": int(tubes.references.shape[1] - 1),
         "propagator": tubes.propagator,
         "rigorous": tubes.rigorous,
@@ -125,6 +130,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
             for c in record.counterexamples
         ],
         "falsifier_rollouts": record.falsifier_rollouts,
+        "samples": None if record.samples is None else dataclasses.asdict(record.samples),
         "seconds": certificate.header.seconds,
         "certificate": str(certificate.path),
         "figure": str(figure) if figure.exists() else None,

@@ -191,7 +191,7 @@ STAGES = (
         "certificate.h5",
         Certificate,
         ("train-dynamics", "train-planner", "train-tracker"),
-        (*_ROBOT, "propagator", "proof", "verify", "start", "disturbance"),
+        (*_ROBOT, "propagator", "proof", "verify", "library.start_spread", "start", "disturbance"),
         variant=_references_file,
         seed="verify.seed",
     ),

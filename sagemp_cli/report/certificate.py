@@ -39,9 +39,9 @@ from sagemp_cli.sets import Box
 from sagemp_cli.storage import Artifact, Certificate, Tubes
 
 _SAYS = {
-    "VERIFIED": "Certified: every start in X$_I$ stays clear and reaches the goal",
-    "FALSIFIED": "Falsified: a replayed counterexample breaks the claim",
-    "UNKNOWN": "Unknown: the tube does not prove it, and no counterexample was found",
+    "VERIFIED": "Certified at the samples: every start in X$_I$ stays clear and reaches the goal",
+    "FALSIFIED": "Falsified at the samples: a replayed counterexample breaks the claim",
+    "UNKNOWN": "Unknown at the samples: the tube does not prove it, and no counterexample was found",
 }
 
 
@@ -193,4 +193,4 @@ def _deciding(tubes: Tubes) -> str:
         r = open_ones[0]
         return f"{tubes.verdict[r]} at step {tubes.step[r]} ({tubes.constraint[r]})"
     r, c = np.unravel_index(tubes.clearance.argmin(), tubes.clearance.shape)
-    return f"SAFE, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"
+    return f"SAFE at the samples, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"

@@ -78,7 +78,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         f"{subject(artifact.header)}: {record.sampled} references sampled, "
         f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s; "
-        f"certified clearance at least {tubes.clearance.min():.2f} m",
+        f"certified clearance at least {tubes.clearance.min():.2f} m at the samples",
         colour=SAFE if count >= record.wanted else INK,
     )
     return figure

@@ -15,6 +15,7 @@ from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.pipeline.proof import Proof
 from sagemp_cli.pipeline.reference_file import read_references
+from sagemp_cli.pipeline.sample_share import sample_share
 from sagemp_cli.pipeline.true_model import SECTION as TRUE_MODEL
 from sagemp_cli.pipeline.true_model import TrueModelProof
 from sagemp_cli.pipeline.tubes import tubes_record
@@ -35,6 +36,7 @@ class Options:
     Attributes:
         references: sampled from the planner, if there is no file; None: one, of a file's planner all.
         seed: of what is sampled.
+        samples: further plans of the planner, of which the certificate says how many certify too.
         file: references to verify instead.
         falsifier: how hard the verdicts are attacked.
         true_model: options of :class:`~sagemp_cli.pipeline.true_model.TrueModelProof`.
@@ -42,6 +44,7 @@ class Options:
 
     references: Count | None
     seed: Whole
+    samples: Whole
     file: str | None
     falsifier: FalsifierOptions | None
     true_model: Mapping[str, Any] | None
@@ -64,8 +67,8 @@ def run(context: StageContext) -> Path:
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker = tracker_from(tracker_file)
     inputs: tuple[Artifact[Any] | Parent, ...] = (planner_file, tracker_file, *robot_files)
+    planner = planner_from(planner_file)
     if section.file is None:
-        planner = planner_from(planner_file)
         every = len(planner.trajectories) if isinstance(planner, FromFile) else 1
         references = planner.sample(
             problem.start.center,
@@ -78,7 +81,8 @@ def run(context: StageContext) -> Path:
         file = Path(section.file)
         references = read_references(file, horizon=problem.horizon, state_names=problem.dynamics.state_names)
         inputs = (*inputs, context.source(REFERENCES, file))
-    pieces = PartialResults.of(context, "verify", inputs, without=("verify.falsifier",))
+    beside = ("verify.falsifier", "verify.samples")  # no piece of the proof depends on them
+    pieces = PartialResults.of(context, "verify", inputs, without=beside)
     verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
     refutation = attack(
         verification,
@@ -88,6 +92,7 @@ def run(context: StageContext) -> Path:
         options=section.falsifier,
         progress=context.progress,
     )
+    given = section.file is not None or isinstance(planner, FromFile)  # plans that nobody can draw more of
     for r, example in refutation.unproved:
         context.progress.say(
             f"reference {r}: a rollout breaks '{decided(example, problem.dynamics)}' by {example.depth:.3g} in "
@@ -104,6 +109,7 @@ def run(context: StageContext) -> Path:
         verdict=str(answer_of(refutation.verification.verdicts)),
         dynamics=robot_files[0].record.weights if robot_files else None,
         true_model=folded.verify(references, tracker, context.progress) if folded and verification.safe else None,
+        samples=None if given else sample_share(context, planner, tracker, proof, wanted=section.samples),
     )
     path = context.write("verify", record, inputs)
     pieces.remove()

@@ -180,6 +180,15 @@ class TrueModel:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Samples:
+    """Further plans of the planner, of which the certificate says how many could be certified and proves nothing."""
+
+    drawn: int = scalar("plans drawn, from starts as those of a library")
+    certified: int = scalar("how many of them 'affine' certified, from all of X_I")
+    seed: int = scalar("what they were drawn with")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Certificate:
     """What ``verify`` proved, with everything that the proof speaks about."""
 
@@ -192,6 +201,9 @@ class Certificate:
     dynamics: dict[str, np.ndarray] | None = weights("of a learned robot: its weights, exact", optional=True)
     true_model: TrueModel | None = group(
         TrueModel, "of a learned robot: what holds of its analytical model", optional=True
+    )
+    samples: Samples | None = group(
+        Samples, "further plans, if any were drawn: said by whoever made the file, not proved", optional=True
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sagemp_cli.config.composition import compose
 from sagemp_cli.pipeline.stage import STAGES, stages_of
-from sagemp_cli.storage import Rollouts, TrackerModel, read_artifact
+from sagemp_cli.storage import Rollouts, Samples, TrackerModel, read_artifact
 
 NAMES = [stage.name for stage in stages_of(compose([]))]
 FOLDER = Path("artifacts/unicycle_node")
@@ -26,8 +26,10 @@ def test_run_makes_everything_in_order_and_ends_with_verdict_certificate_and_fig
     assert result.exit_code == 0, result.stderr
     assert made_up.ran == NAMES
     lines = result.stdout.splitlines()
-    begin = lines.index("VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, a text)")
-    assert lines[begin + 1] == "  reference 0: SAFE at all steps, keeps 0.25 m from lower disc"
+    begin = lines.index(
+        "VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, at the samples, a text)"
+    )
+    assert lines[begin + 1] == "  reference 0: SAFE at the samples, keeps 0.25 m from lower disc"
     # The made-up controls go beyond the robot's limits, and whoever reads the verdict is told.
     assert lines[begin + 2].startswith("  controls: turn_rate asks for ")
     assert lines[begin + 2].endswith(" rad/s, beyond its limits -1.5 to 1.5; the proof holds for actuators that follow")
@@ -450,3 +452,14 @@ def test_a_figure_that_is_missing_beside_a_file_that_is_up_to_date_is_drawn(sage
     assert figure.exists()
     assert made_up.ran == ran
     assert f"figure {figure}" in result.stderr
+
+
+def test_the_verdict_comes_with_the_share_of_further_plans_that_certify(sagemp, made_up):
+    made_up.certificate["samples"] = Samples(drawn=20, certified=14, seed=3)
+    sagemp("run", "--until", "train-tracker")
+    result = sagemp("verify")
+    assert "  further plans of the planner: 14 of 20 certify too (seed 3)" in result.stdout.splitlines()
+    found = json.loads(sagemp("verify", "--json").stdout)
+    assert found["samples"] == {"drawn": 20, "certified": 14, "seed": 3}
+    made_up.certificate["samples"] = None
+    assert "further plans" not in sagemp("verify", "--overwrite").stdout

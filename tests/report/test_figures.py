@@ -12,7 +12,8 @@ from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.library import draw_library
 from sagemp_cli.report.reproduce import FIGURES, draw_experiment, main
 from sagemp_cli.report.rollouts import NAMED, draw_rollouts
-from sagemp_cli.storage import KINDS, Certificate, Counterexample, Library, Rollouts, read_artifact
+from sagemp_cli.report.safety import draw_safety
+from sagemp_cli.storage import KINDS, Certificate, Counterexample, Library, Rollouts, SafetyRates, read_artifact
 
 TUBE = ("tube_lower", "tube_upper")
 
@@ -69,7 +70,7 @@ def test_a_damaged_artifact_is_an_error_not_a_figure(tmp_path, capsys):
 def test_the_title_states_verdict_cells_horizon_and_time(certificate):
     title, subtitle = texts(draw_certificate(certificate))
     assert title.startswith("Certified")
-    for part in ("SAFE, passes disc at", "4 cells", "K = 25 (2.5 s)", "affine in", "rounding included"):
+    for part in ("SAFE at the samples, passes disc at", "4 cells", "K = 25 (2.5 s)", "affine in", "rounding included"):
         assert part in subtitle
 
 
@@ -78,6 +79,21 @@ def changed(certificate, **tubes):
     return dataclasses.replace(
         certificate, record=dataclasses.replace(record, tubes=dataclasses.replace(record.tubes, **tubes))
     )
+
+
+def test_every_figure_of_a_claim_says_that_it_holds_at_the_samples(toy_folder, certificate):
+    library = read_artifact(toy_folder / "library.h5", Library)
+    shown = [
+        draw_certificate(certificate),
+        draw_library(library),
+        draw_rollouts(read_artifact(toy_folder / "rollouts.h5", Rollouts), library),
+        draw_safety(read_artifact(toy_folder / "safety.h5", SafetyRates)),
+    ]
+    for verdict in ("FALSIFIED", "UNKNOWN"):
+        record = dataclasses.replace(certificate.record, verdict=verdict)
+        shown.append(draw_certificate(dataclasses.replace(certificate, record=record)))
+    for figure in shown:
+        assert "at the samples" in " ".join(" ".join(texts(figure)).split())
 
 
 def test_a_tube_that_overflows_is_drawn_up_to_there(certificate, tmp_path):

@@ -5,6 +5,7 @@ import torch
 from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import planner_from, tracker_from
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.pipeline.stage import STAGES, stage_named
@@ -193,3 +194,56 @@ def test_references_of_a_library_start_in_the_share_of_the_start_box_that_the_co
     assert bool((away <= spread * start.radius + 1e-12).all())
     uncertain = start.radius > 0
     assert bool((away.amax(0)[uncertain] >= 0.9 * spread * start.radius[uncertain]).all())
+
+
+def test_a_certificate_says_how_many_further_plans_certify(toy_folder):
+    artifact = read(toy_folder, "verify")
+    found, config = artifact.record.samples, artifact.header.config
+    assert (found.drawn, found.seed) == (config["verify"]["samples"], 0) == (2, 0)
+    assert 0 <= found.certified <= found.drawn
+
+
+def test_the_share_of_further_plans_counts_what_affine_certifies_from_all_of_the_start_box(work, monkeypatch):
+    from sagemp_cli.pipeline import sample_share as module
+    from sagemp_cli.pipeline.proof import Proof
+
+    context = work("train-planner", "train-tracker", overrides=("verify.seed=3",))
+    seen = []
+    prove = Proof.verify
+
+    def watched(proof, references, tracker, **options):
+        found = prove(proof, references, tracker, **options)
+        seen.append((proof.propagator.name, references, found.start, found.safe))
+        return found
+
+    monkeypatch.setattr(Proof, "verify", watched)
+    problem = problem_of(context.config)
+    planner, tracker = planner_from(context.read("train-planner")), tracker_from(context.read("train-tracker"))
+    found = module.sample_share(context, planner, tracker, Proof.of(context.config, problem), wanted=5)
+    ((propagator, references, start, safe),) = seen
+    assert propagator == "affine" and (found.drawn, found.certified, found.seed) == (5, len(safe), 3)
+    assert len(torch.unique(references[:, 0], dim=0)) == 5, "each from a start of its own"
+    assert torch.equal(start.lower, problem.start.lower.expand(5, -1)), "each proved from all of X_I"
+    assert module.sample_share(context, planner, tracker, Proof.of(context.config, problem), wanted=0) is None
+
+
+def test_of_a_planner_that_is_a_file_every_trajectory_is_verified_and_no_further_ones_drawn(work, tmp_path):
+    plan = read(work("verify").folder, "verify").record.tubes.references[0]
+    np.savez(tmp_path / "plans.npz", references=np.stack([plan, plan + 0.001, plan - 0.001]))
+    overrides = (
+        "name=mine",
+        "planner=from_file",
+        f"planner.path={tmp_path / 'plans.npz'}",
+        "sources.train-tracker=unicycle_node",
+    )
+    work("gen-data", "train-planner", "train-tracker")
+    context = StageContext.of(compose(["effort=toy", f"artifacts={tmp_path}", *overrides]))
+    for name in ("train-planner", "verify"):
+        stage_named(name).run(context)
+    found = read(context.folder, "verify").record
+    assert len(found.tubes.verdict) == 3 and found.samples is None
+    single = StageContext.of(
+        compose(["effort=toy", f"artifacts={tmp_path}", *overrides, "verify.references=1"]), overwrite=True
+    )
+    stage_named("verify").run(single)
+    assert len(read(context.folder, "verify").record.tubes.verdict) == 1
