@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.loop.tracker import Tracker
 
 
@@ -24,12 +25,12 @@ class ClosedLoop:
 
     Attributes:
         dynamics: the robot.
-        tracker: the policy ``u = pi(e)``.
+        tracker: the policy, ``u = pi(e)`` or another function of the state and the next points of the reference.
         references: ``(..., K+1, n)``; leading dimensions are batch and broadcast against those of the state.
     """
 
     dynamics: Dynamics
-    tracker: Tracker
+    tracker: Controller
     references: Tensor
 
     def __post_init__(self) -> None:
@@ -62,7 +63,7 @@ class ClosedLoop:
         return self.references[..., index, :]
 
     def control(self, k: int, x: Tensor) -> Tensor:
-        """``u_k = pi(e_k)`` with ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]`` (equation 6)."""
+        """``u_k``; of the paper's tracker ``pi(e_k)``, ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]`` (equation 6)."""
         return self.control_given(self.window(k), x)
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
@@ -82,10 +83,22 @@ class ClosedLoop:
 
     def control_given(self, given: Tensor, x: Tensor) -> Tensor:
         """``u_k``, for a window."""
-        return self.tracker(given - x[..., None, :])
+        return self.tracker.control(given, x)
+
+    @property
+    def folds(self) -> bool:
+        """Whether there is a :meth:`folded` loop."""
+        return isinstance(self.tracker, Tracker) and self.tracker.folds
 
     def folded(self) -> FoldedLoop:
-        """The same loop with the tracker's first layer folded onto the fixed references."""
+        """The same loop with the tracker's first layer folded onto the fixed references.
+
+        Raises:
+            UsageError: the tracker's first layer does not act on the lookahead errors (see :attr:`folds`).
+        """
+        if not self.folds:
+            raise UsageError(f"{type(self.tracker).__name__} has no first layer that could be folded")
+        assert isinstance(self.tracker, Tracker)
         folds = [self.tracker.folded(self.window(k)) for k in range(self.horizon)]
         biases = torch.stack([bias for _, bias in folds], dim=-2)
         return FoldedLoop(self.dynamics, self.tracker, folds[0][0], biases)

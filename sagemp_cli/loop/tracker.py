@@ -7,9 +7,10 @@ from torch import Tensor, nn
 
 from sagemp_cli.config.ranges import Count, Decay, Widths
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.loop.controller import Controller, lookahead_errors
 
 
-class Tracker(nn.Module):
+class Tracker(Controller):
     """``u = pi(e)``: lookahead errors ``e (..., N, n)`` to controls ``(..., m)``, leaky-ReLU MLP.
 
     The errors are flattened and multiplied by fixed per-state ``error_scale`` (a diagonal part of the first
@@ -65,8 +66,25 @@ class Tracker(nn.Module):
             nn.Linear(a, b, dtype=torch.float64) for a, b in zip(widths[:-1], widths[1:], strict=True)
         )
 
+    def features(self, window: Tensor, x: Tensor) -> Tensor:
+        """What the network is given, ``(..., N, n)``: the lookahead errors.
+
+        A class of one's own may give others of that shape, in torch operations; see ``docs/adding.md``.
+        """
+        return lookahead_errors(window, x)
+
+    def control(self, window: Tensor, x: Tensor) -> Tensor:
+        """Controls ``(..., m)``; see :class:`~sagemp_cli.loop.controller.Controller`."""
+        return self(self.features(window, x))
+
+    @property
+    def folds(self) -> bool:
+        """Whether :meth:`folded` says what the first layer does: not of a class of one's own with other features."""
+        own = type(self)
+        return own.features is Tracker.features and own.control is Tracker.control and own.forward is Tracker.forward
+
     def forward(self, errors: Tensor) -> Tensor:
-        """Controls ``(..., m)`` from lookahead errors ``(..., N, n)``."""
+        """Controls ``(..., m)`` from lookahead errors (or other features) ``(..., N, n)``."""
         return self.after_first(self.layers[0]((errors * self.error_scale).flatten(-2)))
 
     def after_first(self, h: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from sagemp_cli.reading import wire
 from sagemp_cli.reading.budget import Budget, RefusedError, most_seconds
 from sagemp_cli.reading.hdf5 import datasets_of, tree_of
 from sagemp_cli.reading.npz import arrays_of
+from sagemp_cli.reading.onnx_file import graph_of
 
 _MARGIN = 2**26
 
@@ -69,6 +70,8 @@ def _read(request: dict[str, Any], file: BinaryIO, budget: Budget) -> dict[str, 
         case "npz":
             names, arrays = arrays_of(file, budget, wanted)
             return {"names": names, "arrays": arrays}
+        case "onnx":
+            return {"graph": graph_of(file, budget)}
         case "arrays":
             with _hdf5(request["path"], file) as opened:
                 names, arrays = datasets_of(opened, budget, wanted)

@@ -64,6 +64,15 @@ def read_arrays(path: Path, wanted: Collection[str] | None = None) -> tuple[list
     return found["names"], found["arrays"]
 
 
+def read_onnx(path: Path) -> dict[str, Any]:
+    """What an ONNX file says, see :func:`sagemp_cli.reading.onnx_file.graph_of`.
+
+    Raises:
+        ArtifactError: as :func:`read_tree`; or it holds what a plain network does not have.
+    """
+    return _asked(path, {"format": "onnx"}, what="an ONNX file", damaged="not a readable ONNX file")["graph"]
+
+
 def _asked(path: Path, request: dict[str, Any], *, what: str, damaged: str) -> dict[str, Any]:
     size = require_regular(path, what)
     request |= {"path": os.path.abspath(path), "damaged": damaged}

@@ -62,25 +62,25 @@ class AutoLirpa:
                 f"auto_lirpa: start must have shape (..., {n}) and disturbance (d,), "
                 f"found {tuple(start.lower.shape)} and {tuple(disturbance.lower.shape)}"
             )
-        if isinstance(loop, ClosedLoop):
+        if isinstance(loop, ClosedLoop) and loop.folds:
             loop = loop.folded()
-        if not isinstance(loop, FoldedLoop):
+        if not isinstance(loop, ClosedLoop | FoldedLoop):
             cells = Box(start.lower.reshape(-1, n), start.upper.reshape(-1, n))
             low, high = self._cells(loop, cells, disturbance)
             return Tube(low.reshape(*start.lower.shape[:-1], -1, n), high.reshape(*start.lower.shape[:-1], -1, n))
-        batch = torch.broadcast_shapes(loop.biases.shape[:-2], start.lower.shape[:-1])
+        own = "biases" if isinstance(loop, FoldedLoop) else "references"
+        rows = getattr(loop, own).detach()
+        batch = torch.broadcast_shapes(rows.shape[:-2], start.lower.shape[:-1])
         lower, upper = (corner.expand(*batch, n).reshape(-1, n) for corner in (start.lower, start.upper))
         # Cells often come with a copy of their reference each: equal references make one call.
-        biases, which = torch.unique(
-            loop.biases.detach().expand(*batch, *loop.biases.shape[-2:]).reshape(-1, *loop.biases.shape[-2:]),
-            dim=0,
-            return_inverse=True,
+        different, which = torch.unique(
+            rows.expand(*batch, *rows.shape[-2:]).reshape(-1, *rows.shape[-2:]), dim=0, return_inverse=True
         )
         low = torch.empty(len(which), loop.horizon + 1, n, dtype=torch.float64)
         high = torch.empty_like(low)
-        for r, bias in enumerate(biases):
+        for r, part in enumerate(different):
             mine = which == r
-            one = dataclasses.replace(loop, biases=bias)
+            one = dataclasses.replace(loop, **{own: part})
             low[mine], high[mine] = self._cells(one, Box(lower[mine], upper[mine]), disturbance)
         return Tube(low.reshape(*batch, -1, n), high.reshape(*batch, -1, n))
 

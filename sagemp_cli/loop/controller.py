@@ -1,0 +1,49 @@
+"""What steers the robot in a closed loop: any function of the state and of the next points of the reference."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+
+class Controller(nn.Module, ABC):
+    """``u_k = control([p_{k+1}, ..., p_{k+N}], x_k)``, written once in torch operations.
+
+    The same function is simulated, trained, bounded by the propagators and carried by certificates, as the numbers that
+    it holds and the operations that it does: there may be any batch in front of the dimensions that are said, and a
+    value may only be looked at by torch operations. Weights that are parameters or buffers in float64 are stored and
+    proved as the exact numbers that they are.
+
+    Attributes:
+        state_dim: number of states n.
+        control_dim: number of controls m.
+        lookahead: points of the reference that are seen, N.
+        trains: whether training can change it; one that cannot is taken as it is.
+    """
+
+    state_dim: int
+    control_dim: int
+    lookahead: int
+    trains: ClassVar[bool] = True
+
+    @abstractmethod
+    def control(self, window: Tensor, x: Tensor) -> Tensor:
+        """Controls ``(..., m)``.
+
+        Args:
+            window: the next points of the reference, ``(..., N, n)``.
+            x: states, ``(..., n)``.
+        """
+
+    def control_range(self) -> tuple[Tensor, Tensor]:
+        """What no control leaves in real arithmetic, ``(m,)`` each; infinite if nothing is known."""
+        everywhere = torch.full((self.control_dim,), torch.inf, dtype=torch.float64)
+        return -everywhere, everywhere
+
+
+def lookahead_errors(window: Tensor, x: Tensor) -> Tensor:
+    """The paper's ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]``, ``(..., N, n)`` (equation 6)."""
+    return window - x[..., None, :]

@@ -1,0 +1,1 @@
+"""Controllers that come as ONNX files, and ours written as such."""
