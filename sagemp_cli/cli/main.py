@@ -13,6 +13,7 @@ from sagemp_cli.cli import (
     config,
     doctor,
     execute,
+    export,
     gen_data,
     init,
     inspect,
@@ -62,6 +63,7 @@ for _name, _function, _examples, _panel in (
 ):
     app.command(_name, cls=Command, help=flowing(_function), epilog=_examples, rich_help_panel=_panel)(_function)
 app.add_typer(config.app, name="config", rich_help_panel=_AROUND)
+app.add_typer(export.app, name="export", rich_help_panel=_AROUND)
 
 
 def _print_version(wanted: bool) -> None:

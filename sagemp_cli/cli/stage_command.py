@@ -122,7 +122,9 @@ def explain(context: StageContext, states: dict[str, FileState], name: str) -> N
 def draw_if_missing(context: StageContext, stage: Stage) -> None:
     """Draw the figure of a file that is up to date, if it is not there: an interrupt may have come before it."""
     if context.owner(stage.name) is context and not context.output_path(stage.name).with_suffix(".png").exists():
-        context.progress.say(f"figure {stage.draw(context)}")
+        drawn = stage.draw(context)
+        if drawn is not None:
+            context.progress.say(f"figure {drawn}")
 
 
 def announce(path: Path) -> None:

@@ -12,7 +12,7 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import random_disturbances, worst_case_disturbances
 from sagemp_cli.library.closest import closest_reference
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.sets import Box, Tube
@@ -53,7 +53,7 @@ def execute_queries(
     propose: Callable[[Tensor], Tensor],
     *,
     problem: Problem,
-    tracker: Tracker,
+    tracker: Controller,
     starts: Tensor,
     rollouts: int,
     generator: torch.Generator,

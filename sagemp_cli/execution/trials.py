@@ -17,7 +17,7 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.execution.disturbances import Loop, random_disturbances, worst_case_disturbances
 from sagemp_cli.execution.open_loop import OpenLoop
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.verification.attack.refutation import SoundnessError
@@ -66,7 +66,7 @@ def try_references(
     references: Tensor,
     problem: Problem,
     *,
-    tracker: Tracker,
+    tracker: Controller,
     rollouts: int,
     generator: torch.Generator,
     within_limits: bool = True,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +30,25 @@ class Controller(nn.Module, ABC):
     control_dim: int
     lookahead: int
     trains: ClassVar[bool] = True
+
+    @classmethod
+    def taken(cls, **options: Any) -> Controller:
+        """One that does not train, from the options of its section; where it needs a file, it reads it here.
+
+        Only ``train-tracker`` calls this, for the person who runs it; what reads artifacts calls the constructor.
+        """
+        return cls(**options)
+
+    def arguments(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """What its constructor is to be called with, to be the same again once its weights are loaded.
+
+        Plain data, which an artifact keeps; of ``given``, what it was made from, everything by default.
+        """
+        return dict(given)
+
+    def files(self) -> tuple[Path, ...]:
+        """Files that it was made from."""
+        return ()
 
     @abstractmethod
     def control(self, window: Tensor, x: Tensor) -> Tensor:

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from sagemp_cli.config.binding import NAME, build, parameters_of, target_class
+from sagemp_cli.config.binding import NAME, build, options_for, parameters_of, target_class
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ArtifactError, ConfigError
 from sagemp_cli.learning.fit import History
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.planners.base import StoredPlanner
 from sagemp_cli.planners.own import OwnPlanner
 from sagemp_cli.plugins import KINDS
@@ -81,15 +81,46 @@ def stand_in(config: Mapping[str, Any]) -> str:
     return "" if said is None or from_file else said(config["planner"])
 
 
-def tracker_from(artifact: Artifact[TrackerModel]) -> Tracker:
+def tracker_of(section: Mapping[str, Any], dynamics: Dynamics, horizon: int) -> tuple[Controller, dict[str, Any]]:
+    """The tracker of a config, and the arguments from which it is made again with its weights.
+
+    One that trains has its initial weights, which torch's generator draws; another is taken as it is, from its file if
+    it has one.
+
+    Raises:
+        ConfigError: it is no controller, or not one of this robot.
+    """
+    extra = data_arguments(section, "tracker", dynamics, horizon)
+    kind = target_class(section, "tracker")
+    given = {key: value for key, value in section.items() if key != NAME}
+    if getattr(kind, "trains", True):
+        made = build(section, "tracker", **extra)
+    else:
+        made = kind.taken(**options_for(kind, given, "tracker", given=tuple(extra)), **extra)
+    if not isinstance(made, Controller):
+        raise ConfigError(
+            f"tracker '{section[NAME]}' is no Controller (see docs/adding.md), found {type(made).__name__}"
+        )
+    if (made.state_dim, made.control_dim) != (dynamics.state_dim, dynamics.control_dim):
+        raise ConfigError(
+            f"tracker '{section[NAME]}' is for {made.state_dim} states and {made.control_dim} controls, "
+            f"the robot has {dynamics.state_dim} and {dynamics.control_dim}"
+        )
+    plain = {key: value for key, value in extra.items() if key != "robot"}
+    return made, made.arguments(given | plain)
+
+
+def tracker_from(artifact: Artifact[TrackerModel]) -> Controller:
     """The trained tracker, of the kind that the artifact's config names.
 
     Raises:
         ArtifactError: what the file says is no tracker.
     """
-    arguments = _arguments(artifact.record.arguments, artifact)
+    arguments, config = _arguments(artifact.record.arguments, artifact), artifact.header.config
     try:
-        module = build({**arguments, NAME: artifact.header.config["tracker"].get(NAME)}, "tracker")
+        section = {**arguments, NAME: config["tracker"].get(NAME)}
+        robot = "robot" in parameters_of(target_class(section, "tracker"))
+        module = build(section, "tracker", **({"robot": build(config["dynamics"], "dynamics")} if robot else {}))
     except ConfigError as e:
         raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)

@@ -13,7 +13,7 @@ from torch import Tensor
 from sagemp_cli.config.binding import Binding, build
 from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.propagator import Propagator
@@ -80,7 +80,7 @@ class Proof:
         )
 
     def verify(
-        self, references: Tensor, tracker: Tracker, *, pieces: Pieces | None = None, progress: Progress | None = None
+        self, references: Tensor, tracker: Controller, *, pieces: Pieces | None = None, progress: Progress | None = None
     ) -> Verification:
         """Tubes and verdicts of references ``(R, K+1, n)``.
 

@@ -43,6 +43,7 @@ class Stage:
         inputs: names of the stages whose outputs it reads, where those apply.
         sections: dotted config keys that its output depends on, beyond those of its inputs.
         irrelevant: keys in these sections that only say where the work is done, and change nothing in the output.
+        learns: whether, under a config, it makes anything of these inputs at all.
         applies: whether an experiment has this stage at all, from its config.
         variant: what distinguishes its output from the experiment's own, from its config; empty if nothing does.
         seed: dotted key of its seed; that of a stage that only samples is its own, and another one is no contradiction
@@ -55,6 +56,7 @@ class Stage:
     inputs: tuple[str, ...]
     sections: tuple[str, ...]
     irrelevant: tuple[str, ...] = ()
+    learns: Callable[[Mapping[str, Any]], bool] = lambda config: True
     applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
     variant: Callable[[Mapping[str, Any]], str] = lambda config: ""
     seed: str = "seed"
@@ -66,7 +68,7 @@ class Stage:
 
     def inputs_in(self, config: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the stages whose outputs it reads in an experiment."""
-        return tuple(name for name in self.inputs if stage_named(name).applies(config))
+        return tuple(name for name in self.inputs if self.learns(config) and stage_named(name).applies(config))
 
     def seed_in(self, config: Mapping[str, Any]) -> int:
         """Its seed under a config."""
@@ -109,8 +111,11 @@ class Stage:
         self.draw(context)
         return path
 
-    def draw(self, context: StageContext) -> Path:
-        """Draw the figure of the stage's file, which is there (``sagemp_cli.stages.<name>.draw``); return its path."""
+    def draw(self, context: StageContext) -> Path | None:
+        """Draw the figure of the stage's file, which is there (``sagemp_cli.stages.<name>.draw``); return its path.
+
+        None if there is nothing to draw: a tracker that was trained elsewhere has no curve.
+        """
         return self._module.draw(context)
 
     def require_own(self, context: StageContext) -> None:
@@ -152,6 +157,11 @@ def _learns_its_robot(config: Mapping[str, Any]) -> bool:
     return target_class(config["dynamics"], "dynamics") is Learned
 
 
+def _trains_its_tracker(config: Mapping[str, Any]) -> bool:
+    """Whether the tracker is trained here; one that was trained elsewhere is taken as it is."""
+    return getattr(target_class(config["tracker"], "tracker"), "trains", True)
+
+
 def _references_file(config: Mapping[str, Any]) -> str:
     """The name of the file of references, whose certificate is not the experiment's own."""
     file = config["verify"]["file"]
@@ -185,6 +195,7 @@ STAGES = (
         TrackerModel,
         ("train-dynamics", "train-planner"),
         (*_ROBOT, "tracker", "tracker_training", "start", "disturbance", "seed"),
+        learns=_trains_its_tracker,
     ),
     Stage(
         "verify",

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from sagemp_cli.config.binding import Binding
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.pipeline.proof import Proof, counts_of
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.progress import Progress
@@ -41,7 +41,7 @@ class TrueModelProof:
         affine = proof.propagator if isinstance(proof.propagator, Affine) else Affine()
         return cls(dataclasses.replace(proof, propagator=Folded(affine), counts=counts))
 
-    def verify(self, references: Tensor, tracker: Tracker, progress: Progress) -> TrueModel:
+    def verify(self, references: Tensor, tracker: Controller, progress: Progress) -> TrueModel:
         """Tubes and verdicts of references ``(R, K+1, n)``, and how much was folded."""
         found = self.proof.verify(references, tracker, progress=progress)
         plain, deviation = split(found, self.proof.problem.dynamics.control_dim)

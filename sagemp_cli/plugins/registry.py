@@ -72,7 +72,13 @@ KINDS: Mapping[str, Kind] = {
             from_data=_DATA,
             called_with=("start", "goal", "scene", "count", "generator"),
         ),
-        Kind("tracker", "trackers", "tracker", {"mlp": "sagemp_cli.loop.tracker:Tracker"}, from_data=_DATA),
+        Kind(
+            "tracker",
+            "trackers",
+            "tracker",
+            {"mlp": "sagemp_cli.loop.tracker:Tracker", "onnx": "sagemp_cli.loop.onnx_format.tracker:OnnxTracker"},
+            from_data=_DATA,
+        ),
         Kind(
             "propagator",
             "propagators",

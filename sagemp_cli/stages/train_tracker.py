@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from sagemp_cli.config.binding import NAME, Binding, build
+from sagemp_cli.config.binding import Binding
 from sagemp_cli.config.ranges import Count
-from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.learning.fit import GIVEN_TO_TRAINING, History
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.pipeline.context import StageContext
-from sagemp_cli.pipeline.models import curve_of, data_arguments, figures_at_end, planner_from, weights_of
+from sagemp_cli.pipeline.models import curve_of, figures_at_end, planner_from, tracker_of, weights_of
 from sagemp_cli.pipeline.partial import PartialFile
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.report.figure import draw_beside
@@ -24,16 +25,22 @@ from sagemp_cli.trackers.training import train_tracker
 _GIVEN = ("tracker", "dynamics", "references", "start", "disturbance", *GIVEN_TO_TRAINING)
 SECTIONS = (Binding("tracker_training", train_tracker, given=_GIVEN, beside={"references": Count}),)
 
+_NOTHING_LEARNED = History(np.zeros(0), {}, np.zeros(0, np.int64), {})
+
 
 def run(context: StageContext) -> Path:
-    """Train on references of the planner, starts and disturbances of the sets that will be verified."""
+    """Train on references of the planner, starts and disturbances of the sets that will be verified.
+
+    A tracker that was trained elsewhere is taken as it is.
+    """
     (problem, robot_files), options = trained_problem(context), SECTIONS[0].options(context.config)
     count = options.pop("references")
-    extra = data_arguments(context.config["tracker"], "tracker", problem.dynamics, problem.horizon)
-    arguments = {key: value for key, value in context.config["tracker"].items() if key != NAME} | extra
     with torch.random.fork_rng(devices=[]):  # initial weights depend on the root seed, whatever was drawn before
         torch.manual_seed(context.generator("train-tracker: initial weights").initial_seed())
-        tracker: Tracker = build(context.config["tracker"], "tracker", **extra)
+        tracker, arguments = tracker_of(context.config["tracker"], problem.dynamics, problem.horizon)
+    if not tracker.trains:
+        sources = tuple(context.source("network", file) for file in tracker.files())
+        return context.write("train-tracker", _record(tracker, arguments, _NOTHING_LEARNED), sources)
     planner_file = context.read("train-planner")
     planner = planner_from(planner_file)
 
@@ -55,19 +62,25 @@ def run(context: StageContext) -> Path:
         progress=context.progress,
         **options,
     )
-    figures = figures_at_end(history)
-    record = TrackerModel(
-        weights=weights_of(tracker),
-        arguments=json.dumps(arguments),
-        curve=curve_of(history),
-        figure_names=tuple(figures),
-        figures=np.array(list(figures.values())),
-    )
-    path = context.write("train-tracker", record, inputs)
+    path = context.write("train-tracker", _record(tracker, arguments, history), inputs)
     partial.remove()
     return path
 
 
-def draw(context: StageContext) -> Path:
-    """Draw the figure of what is there."""
-    return draw_beside(context.output_path("train-tracker"), draw_training, context.read("train-tracker"))
+def _record(tracker: Controller, arguments: dict[str, Any], history: History) -> TrackerModel:
+    figures = figures_at_end(history) if len(history.loss) else {}
+    return TrackerModel(
+        weights=weights_of(tracker),
+        arguments=json.dumps(arguments),
+        curve=curve_of(history),
+        figure_names=tuple(figures),
+        figures=np.array(list(figures.values()), dtype=np.float64),
+    )
+
+
+def draw(context: StageContext) -> Path | None:
+    """Draw the figure of what is there; there is none of a tracker that was trained elsewhere."""
+    artifact = context.read("train-tracker")
+    if not len(artifact.record.curve.step):
+        return None
+    return draw_beside(context.output_path("train-tracker"), draw_training, artifact)

@@ -20,7 +20,7 @@ from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.learning.fit import History, fit
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.progress import Progress
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers.losses import LossWeights, rollout_loss
@@ -75,7 +75,7 @@ class RolloutSampler:
 
 
 def train_tracker(
-    tracker: Tracker,
+    tracker: Controller,
     dynamics: Dynamics,
     *,
     references: Tensor,
@@ -125,7 +125,7 @@ def train_tracker(
     sampler = RolloutSampler(references, start, disturbance, spread)
 
     def tracking(module: nn.Module, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        assert isinstance(module, Tracker)
+        assert isinstance(module, Controller)
         drawn, x, w = sampler.draw(batch, length, generator)
         states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
         return rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : length + 1], loss_weights)
@@ -135,7 +135,7 @@ def train_tracker(
         return tracking(module, round(first * (rollout_steps / first) ** share), generator)
 
     def with_tube(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        assert isinstance(module, Tracker) and tube is not None
+        assert isinstance(module, Controller) and tube is not None
         value, figures = tracking(module, rollout_steps, generator)
         share = step / max(1, tube_steps - 1)
         width, more = tube(

@@ -17,7 +17,7 @@ from sagemp_cli.config.ranges import Count, NonNegative, Part, Positive
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
 
@@ -58,7 +58,7 @@ class TubeLoss:
 
     def __call__(
         self,
-        tracker: Tracker,
+        tracker: Controller,
         dynamics: Dynamics,
         *,
         references: Tensor,

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.recording import Recording
@@ -178,7 +178,7 @@ class CellProver:
 
     propagator: Propagator
     problem: Problem
-    tracker: Tracker
+    tracker: Controller
 
     def prove(self, chunk: Chunk) -> CellTubes:
         """Bound states and controls of every cell, with one thread wherever it runs."""

@@ -22,6 +22,7 @@ COMMANDS = [
     ["status"],
     ["inspect"],
     ["doctor"],
+    ["export", "tracker"],
     ["config", "show"],
     ["config", "validate"],
     ["config", "list"],

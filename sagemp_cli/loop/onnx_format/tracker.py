@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -14,8 +14,10 @@ from sagemp_cli.loop.controller import Controller, lookahead_errors
 from sagemp_cli.loop.onnx_format.layers import Layer, Network
 from sagemp_cli.loop.onnx_format.lowering import read_network
 
-INPUTS = ("errors", "state", "state_and_reference")
+Inputs = Literal["errors", "state", "state_and_reference"]
 """What a network may be given; see :class:`OnnxTracker`."""
+
+INPUTS: tuple[str, ...] = get_args(Inputs)
 
 
 class OnnxTracker(Controller):
@@ -44,10 +46,10 @@ class OnnxTracker(Controller):
         state_dim: int,
         control_dim: int,
         path: str = "",
-        inputs: str = "errors",
+        inputs: Inputs = "errors",
         control_scale: list[float] | None = None,
         control_offset: list[float] | None = None,
-        network: dict[str, Any] | None = None,
+        network: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         if network is None:
@@ -57,10 +59,10 @@ class OnnxTracker(Controller):
         self.path = path
 
     @classmethod
-    def imported(
-        cls, *, state_dim: int, control_dim: int, path: str = "", inputs: str = "errors", **others: Any
+    def taken(
+        cls, *, state_dim: int, control_dim: int, path: str = "", inputs: Inputs = "errors", **others: Any
     ) -> OnnxTracker:
-        """From the file that ``path`` names; arguments as of the class.
+        """From the file that ``path`` names, see :meth:`~sagemp_cli.loop.controller.Controller.taken`.
 
         Raises:
             ConfigError: no path is given, or the network does not fit the robot.
@@ -77,8 +79,8 @@ class OnnxTracker(Controller):
         made.network = found
         return made
 
-    def stored(self) -> dict[str, Any]:
-        """The constructor's arguments, from which the same tracker is made again once its weights are loaded."""
+    def arguments(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """See :meth:`~sagemp_cli.loop.controller.Controller.arguments`; the network is among them."""
         return {
             "state_dim": self.state_dim,
             "control_dim": self.control_dim,
@@ -88,6 +90,10 @@ class OnnxTracker(Controller):
             "control_offset": self.control_offset.tolist(),
             "network": as_data(self.network),
         }
+
+    def files(self) -> tuple[Path, ...]:
+        """The ONNX file."""
+        return (Path(self.path),)
 
     def features(self, window: Tensor, x: Tensor) -> Tensor:
         """What the network is given, ``(..., size of its input)``; override it for features of your own."""

@@ -10,7 +10,7 @@ import torch
 from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.loop.closed_loop import ClosedLoop
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.sets import Box
@@ -62,7 +62,7 @@ def attack(
     verification: Verification,
     problem: Problem,
     *,
-    tracker: Tracker,
+    tracker: Controller,
     generator: torch.Generator,
     options: FalsifierOptions | None = None,
     progress: Progress | None = None,

@@ -13,7 +13,7 @@ from sagemp_cli.errors import ArtifactError, ConfigError, UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller, lookahead_errors
 from sagemp_cli.loop.onnx_format.tracker import INPUTS, OnnxTracker
-from sagemp_cli.loop.onnx_format.writing import as_network, write_onnx
+from sagemp_cli.loop.onnx_format.writing import as_network, rounding_to_float32, write_onnx
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.crown.best import Best
@@ -63,7 +63,7 @@ DISTURBANCE = Box.around([0.0] * 4, [0.02, 0.02, 0.01, 0.01])
 @pytest.mark.parametrize("propagator", [Affine(), Interval(), Best()], ids=lambda p: p.name)
 def test_the_tube_of_a_foreign_tracker_holds_its_rollouts(inputs, propagator, file_for, robot):
     path = file_for(SIZES[inputs])
-    tracker = OnnxTracker.imported(state_dim=4, control_dim=2, path=str(path), inputs=inputs, control_offset=[0.1, 0.0])
+    tracker = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(path), inputs=inputs, control_offset=[0.1, 0.0])
     assert tracker.lookahead == {"errors": 2, "state": 1, "state_and_reference": 2}[inputs]
     loop = ClosedLoop(robot, tracker, REFERENCE)
     tube = propagator.propagate(loop, START, DISTURBANCE)
@@ -78,7 +78,7 @@ def test_the_tube_of_a_foreign_tracker_holds_its_rollouts(inputs, propagator, fi
 def test_controls_are_those_of_the_network_on_what_it_is_given(inputs, file_for, evaluated):
     path = file_for(SIZES[inputs])
     options = {"inputs": inputs, "control_scale": [2.0, 0.5], "control_offset": [0.25, -1.0]}
-    tracker = OnnxTracker.imported(state_dim=4, control_dim=2, path=str(path), **options)
+    tracker = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(path), **options)
     x, window = torch.randn(7, 4).double(), torch.randn(7, tracker.lookahead, 4).double()
     errors = (window - x[:, None]).flatten(1)
     given = {"errors": errors, "state": x, "state_and_reference": torch.cat([x, window.flatten(1)], 1)}[inputs]
@@ -87,8 +87,8 @@ def test_controls_are_those_of_the_network_on_what_it_is_given(inputs, file_for,
 
 
 def test_what_is_stored_makes_the_same_tracker_again(file_for):
-    tracker = OnnxTracker.imported(state_dim=4, control_dim=2, path=str(file_for(8)), control_scale=[2.0, 3.0])
-    again = OnnxTracker(**json.loads(json.dumps(tracker.stored())))
+    tracker = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(file_for(8)), control_scale=[2.0, 3.0])
+    again = OnnxTracker(**json.loads(json.dumps(tracker.arguments({}))))
     again.load_state_dict(tracker.state_dict())
     x, window = torch.randn(9, 4).double(), torch.randn(9, 2, 4).double()
     assert torch.equal(again.control(window, x), tracker.control(window, x))
@@ -97,17 +97,17 @@ def test_what_is_stored_makes_the_same_tracker_again(file_for):
 def test_a_network_that_does_not_fit_the_robot_is_refused(file_for):
     path = str(file_for(8))
     with pytest.raises(ConfigError, match=r"takes 8 numbers; with tracker.inputs=state a robot of 4 states gives 4"):
-        OnnxTracker.imported(state_dim=4, control_dim=2, path=path, inputs="state")
+        OnnxTracker.taken(state_dim=4, control_dim=2, path=path, inputs="state")
     with pytest.raises(ConfigError, match=r"takes 8 numbers.* a robot of 3 states gives a multiple of 3"):
-        OnnxTracker.imported(state_dim=3, control_dim=2, path=path)
+        OnnxTracker.taken(state_dim=3, control_dim=2, path=path)
     with pytest.raises(ConfigError, match=r"gives 2 numbers, the robot has 1 controls"):
-        OnnxTracker.imported(state_dim=4, control_dim=1, path=path)
+        OnnxTracker.taken(state_dim=4, control_dim=1, path=path)
     with pytest.raises(ConfigError, match=r"must be one of errors, state, state_and_reference, found 'all'"):
-        OnnxTracker.imported(state_dim=4, control_dim=2, path=path, inputs="all")
+        OnnxTracker.taken(state_dim=4, control_dim=2, path=path, inputs="all")
     with pytest.raises(ConfigError, match="tracker.path must name an ONNX file"):
-        OnnxTracker.imported(state_dim=4, control_dim=2)
+        OnnxTracker.taken(state_dim=4, control_dim=2)
     with pytest.raises(ArtifactError, match="no such file"):
-        OnnxTracker.imported(state_dim=4, control_dim=2, path="nowhere.onnx")
+        OnnxTracker.taken(state_dim=4, control_dim=2, path="nowhere.onnx")
 
 
 HOSTILE = {
@@ -164,18 +164,20 @@ def test_a_written_tracker_gives_the_same_controls_by_onnx_itself(ours, tmp_path
     write_onnx(ours, tmp_path / "single.onnx", float32=True)
     rough = evaluated(tmp_path / "single.onnx", errors.flatten(1))
     assert 0 < float((rough - expected).abs().max()) <= 1e-5
+    number, control = rounding_to_float32(ours)
+    assert 0 < number < 1e-6 and 0 < control < 1e-6
 
 
 def test_a_written_tracker_read_again_is_the_same_tracker(ours, tmp_path):
     write_onnx(ours, tmp_path / "net.onnx")
-    again = OnnxTracker.imported(state_dim=4, control_dim=2, path=str(tmp_path / "net.onnx"))
+    again = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(tmp_path / "net.onnx"))
     x, window = torch.randn(100, 4).double(), torch.randn(100, 3, 4).double()
     with torch.no_grad():
         assert torch.equal(again.control(window, x), ours.control(window, x))
         write_onnx(again, tmp_path / "twice.onnx")
-        twice = OnnxTracker.imported(state_dim=4, control_dim=2, path=str(tmp_path / "twice.onnx"))
+        twice = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(tmp_path / "twice.onnx"))
         assert torch.equal(twice.control(window, x), ours.control(window, x))
-    assert twice.stored() | {"path": ""} == again.stored() | {"path": ""}
+    assert twice.arguments({}) | {"path": ""} == again.arguments({}) | {"path": ""}
 
 
 def test_a_foreign_network_of_every_kind_of_layer_survives_writing(saved, tmp_path, evaluated):
@@ -201,7 +203,7 @@ def test_a_foreign_network_of_every_kind_of_layer_survives_writing(saved, tmp_pa
         node("Relu", ["h"], ["i"]),
         node("Add", ["i", "h"], ["y"]),
     ]
-    tracker = OnnxTracker.imported(
+    tracker = OnnxTracker.taken(
         state_dim=3, control_dim=6, path=str(saved(nodes, constants, shape=[2, 3], outputs=[1, 6]))
     )
     write_onnx(tracker, tmp_path / "again.onnx")
@@ -209,7 +211,7 @@ def test_a_foreign_network_of_every_kind_of_layer_survives_writing(saved, tmp_pa
     found, expected = evaluated(tmp_path / "again.onnx", errors), tracker.network(errors)
     assert float(expected.std()) > 0.01
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-    again = OnnxTracker.imported(state_dim=3, control_dim=6, path=str(tmp_path / "again.onnx"))
+    again = OnnxTracker.taken(state_dim=3, control_dim=6, path=str(tmp_path / "again.onnx"))
     torch.testing.assert_close(again.network(errors), expected, rtol=1e-14, atol=1e-14)
 
 

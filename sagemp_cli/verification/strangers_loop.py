@@ -1,0 +1,243 @@
+"""The verdict about a stranger's loop: its recorded program bounded, judged and attacked as our own loops are.
+
+There is no robot, no tracker and no reference here: the loop is a program, and the claim is that from every start in
+X_I and under every disturbance its states keep clear of what a scene says and are in a goal at step K, as far as there
+is a scene and a goal.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability.any_loop import cells_of
+from sagemp_cli.reachability.observed import Observed
+from sagemp_cli.reachability.program.loops import RecordedLoop
+from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.adaptive import adaptive_cells
+from sagemp_cli.verification.attack.ascent import simulate
+from sagemp_cli.verification.attack.falsifier import Counterexample, falsify, margins
+from sagemp_cli.verification.attack.refutation import RATES, SHORT_RATES, SoundnessError
+from sagemp_cli.verification.cells import CellTubes
+from sagemp_cli.verification.verdict import Answer, Outcome, Verdict, answer_of, assess, shortfall
+from sagemp_cli.verification.verification import Verification
+from sagemp_cli.workers import one_thread
+
+
+@dataclass(frozen=True)
+class LoopClaim:
+    """What is to be proved of a loop.
+
+    Attributes:
+        scene: workspace and obstacles over the position, goal over the state; infinite where nothing is asked for.
+        position: entries of the state that are the position.
+        state_names: n names.
+    """
+
+    scene: Scene
+    position: tuple[int, ...]
+    state_names: tuple[str, ...]
+
+    @property
+    def bounds_the_position(self) -> bool:
+        """Whether there is a workspace."""
+        workspace = self.scene.workspace
+        return bool((torch.isfinite(workspace.lower) | torch.isfinite(workspace.upper)).any())
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether there is a goal."""
+        return bool((torch.isfinite(self.scene.goal.lower) | torch.isfinite(self.scene.goal.upper)).any())
+
+    @property
+    def asks(self) -> bool:
+        """Whether anything is asked for; if not, a tube that stays bounded is all that is proved."""
+        return self.bounds_the_position or bool(self.scene.obstacles) or self.has_goal
+
+
+@dataclass(frozen=True)
+class LoopProof:
+    """What was found out about a loop.
+
+    Attributes:
+        loop: the recorded program that it is about.
+        claim: what was asked.
+        verification: one "reference", whose states in ``references`` are NaN: a loop has none.
+        counterexample: a rollout that refutes the claim, proved in rigorous arithmetic.
+        unproved: one that breaks it in float64 only, which refutes nothing.
+        rollouts: that the attack tried.
+    """
+
+    loop: RecordedLoop
+    claim: LoopClaim
+    verification: Verification
+    counterexample: Counterexample | None
+    unproved: Counterexample | None
+    rollouts: int
+
+    @property
+    def answer(self) -> Answer:
+        """VERIFIED, FALSIFIED or UNKNOWN."""
+        return answer_of(self.verification.verdicts)
+
+    @property
+    def tube(self) -> Tube:
+        """Around all rollouts, ``(K+1, n)``."""
+        return self.verification.tube.hull()
+
+
+def verify_loop(
+    seen: Observed,
+    propagator: Propagator,
+    claim: LoopClaim,
+    *,
+    counts: Sequence[int] | None,
+    budget: int = 64,
+    cells_at_once: int = 64,
+    restarts: int = 16,
+    generator: torch.Generator,
+) -> LoopProof:
+    """Bound, judge and attack a loop.
+
+    Args:
+        seen: the recorded loop, its start box and its disturbance box.
+        propagator: bounds it.
+        claim: what is to be proved.
+        counts: cells per uncertain start dimension, all of them 1 if there is none; None for an adaptive partition.
+        budget: cells at most, in an adaptive partition.
+        cells_at_once: cells in one call of the propagator.
+        restarts: ascents of the attack per constraint, if the claim is not proved; a few if it is.
+        generator: draws where they begin.
+
+    Raises:
+        UsageError: the step is found to differ from what was recorded of it.
+        SoundnessError: a claim that was proved is refuted.
+    """
+    if claim.scene.goal.dim != seen.start.dim or len(claim.state_names) != seen.start.dim:
+        raise UsageError(f"the loop has {seen.start.dim} states, the claim speaks of {claim.scene.goal.dim}")
+    work = _Cells(seen, propagator, cells_at_once)
+    if counts is None:
+        found = adaptive_cells(
+            work,
+            Box(seen.start.lower[None], seen.start.upper[None]),
+            budget=budget,
+            shortfall=lambda tube: _shortfall(tube, claim),
+            hopeless=lambda owner, cells: _breaks(seen, claim, cells),
+        )
+    else:
+        cells = cells_of(seen.start, counts)
+        found = work(torch.zeros(len(cells.lower), dtype=torch.int64), cells)
+    seen.compare(found.cells, found.tube.hull())
+    judged = assess(
+        found.tube,
+        claim.scene,
+        cell_reference=found.cell_reference,
+        position=claim.position,
+        state_names=claim.state_names,
+    )
+    n, steps = seen.start.dim, seen.loop.horizon
+    first = 0 if claim.bounds_the_position else 1  # a workspace that is not there is no constraint
+    verification = Verification(
+        references=torch.full((1, steps + 1, n), torch.nan, dtype=torch.float64),
+        start=Box(seen.start.lower[None], seen.start.upper[None]),
+        disturbance=seen.disturbance,
+        cell_reference=found.cell_reference,
+        cells=found.cells,
+        tube=found.tube,
+        control_lower=found.control_lower.amin(0, keepdim=True),
+        control_upper=found.control_upper.amax(0, keepdim=True),
+        verdicts=judged.verdicts,
+        constraint_names=claim.scene.constraint_names[first:],
+        clearance=judged.clearance[:, first:],
+        goal_margin=judged.goal_margin,
+        seconds=found.seconds.sum(0, keepdim=True),
+        propagator=propagator.name,
+        rigorous=propagator.rigorous,
+        recording=found.recording,
+    )
+    return _attacked(seen, claim, verification, restarts, generator)
+
+
+class _Cells:
+    """Proves cells in chunks."""
+
+    def __init__(self, seen: Observed, propagator: Propagator, at_once: int) -> None:
+        self.seen, self.propagator, self.at_once = seen, propagator, at_once
+
+    def __call__(self, owner: Tensor, cells: Box) -> CellTubes:
+        chunks = zip(*(x.split(self.at_once) for x in (owner, cells.lower, cells.upper)), strict=True)
+        return CellTubes.join([self._proved(own, Box(low, high)) for own, low, high in chunks])
+
+    def _proved(self, owner: Tensor, cells: Box) -> CellTubes:
+        loop, began, recording = self.seen.loop, time.perf_counter(), None
+        with torch.no_grad(), one_thread():
+            run = getattr(self.propagator, "run", None)
+            if run is None:
+                tube = self.propagator.propagate(loop, cells, self.seen.disturbance)
+            else:
+                done = run(loop, cells, self.seen.disturbance)
+                tube, recording = done.tube, _recording(done, loop)
+        seconds = torch.full((len(owner),), (time.perf_counter() - began) / len(owner), dtype=torch.float64)
+        nothing = torch.zeros(len(owner), loop.horizon, 0, dtype=torch.float64)
+        return CellTubes(owner, cells, tube, nothing, nothing, seconds, recording)
+
+
+def _recording(run: object, loop: RecordedLoop) -> Recording | None:
+    """What a checker needs, of loops whose steps are all the same program; the recordings of others do not line up."""
+    make = getattr(run, "recording", None)
+    return None if make is None or len(loop.programs) > 1 else make()
+
+
+def _shortfall(tube: Tube, claim: LoopClaim) -> tuple[Tensor, Tensor]:
+    safe, missing = shortfall(tube, claim.scene, position=claim.position)
+    return safe, torch.nan_to_num(missing, nan=1e300, posinf=1e300)
+
+
+def _breaks(seen: Observed, claim: LoopClaim, cells: Box) -> Tensor:
+    """Whether a rollout from the centre of each cell breaks the claim in float64, ``(B,)``, which proves nothing."""
+    x = cells.center
+    w = seen.disturbance.center.expand(len(x), seen.loop.horizon, -1)
+    with torch.no_grad():
+        states = simulate(seen.loop, x, w)
+    return (margins(states, claim.scene, claim.position) < 0).flatten(1).any(1)
+
+
+def _attacked(
+    seen: Observed, claim: LoopClaim, verification: Verification, restarts: int, generator: torch.Generator
+) -> LoopProof:
+    """With what an attack found: a refuted claim is UNSAFE."""
+    safe = verification.verdicts[0].outcome is Outcome.SAFE
+    starts, rates = (min(restarts, 2), SHORT_RATES) if safe else (restarts, RATES)
+    example = None
+    if starts > 0 and claim.asks:
+        (example,) = falsify(
+            seen.loop,
+            seen.start,
+            seen.disturbance,
+            scene=claim.scene,
+            position=claim.position,
+            generator=generator,
+            restarts=starts,
+            rates=rates,
+        )
+    rollouts = starts * (len(claim.scene.constraint_names) + 1) * (len(rates) + 1) if claim.asks else 0
+    if example is None or not example.proved:
+        return LoopProof(seen.loop, claim, verification, None, None if safe else example, rollouts)
+    name = f"goal {claim.state_names[example.state]}" if example.kind == "goal" else example.name
+    if safe:
+        raise SoundnessError(
+            f"the loop was certified by '{verification.propagator}', but a replayed rollout breaks '{name}' at step "
+            f"{example.step} by {example.depth:.3g}; please report this"
+        )
+    verdicts = (Verdict(Outcome.UNSAFE, example.step, name),)
+    refuted = dataclasses.replace(verification, verdicts=verdicts)
+    return LoopProof(seen.loop, claim, refuted, example, None, rollouts)
