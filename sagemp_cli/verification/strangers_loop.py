@@ -11,11 +11,14 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
 
+from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UsageError
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.any_loop import cells_of
 from sagemp_cli.reachability.observed import Observed
 from sagemp_cli.reachability.program.loops import RecordedLoop
@@ -208,7 +211,12 @@ def _breaks(seen: Observed, claim: LoopClaim, cells: Box) -> Tensor:
     w = seen.disturbance.center.expand(len(x), seen.loop.horizon, -1)
     with torch.no_grad():
         states = simulate(seen.loop, x, w)
-    return (margins(states, claim.scene, claim.position) < 0).flatten(1).any(1)
+    return (margins(states, _problem(seen, claim)) < 0).flatten(1).any(1)
+
+
+def _problem(seen: Observed, claim: LoopClaim) -> Problem:
+    """The claim as attacks want it. Of the robot, which there is none, they ask only where the position is."""
+    return Problem(cast(Dynamics, claim), claim.scene, seen.start, seen.disturbance, seen.loop.horizon)
 
 
 def _attacked(
@@ -221,10 +229,7 @@ def _attacked(
     if starts > 0 and claim.asks:
         (example,) = falsify(
             seen.loop,
-            seen.start,
-            seen.disturbance,
-            scene=claim.scene,
-            position=claim.position,
+            _problem(seen, claim),
             generator=generator,
             restarts=starts,
             rates=rates,
