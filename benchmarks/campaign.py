@@ -25,10 +25,10 @@ import torch
 from inner import SIMULATION_MARGIN, attack_tube
 
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.pipeline.models import robot_from, tracker_from
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.storage import Certificate, Library, open_header, read_artifact
-from sagemp_cli.trackers import Tracker
+from sagemp_cli.storage import Certificate, DynamicsModel, Library, TrackerModel, open_header, read_artifact
 
 BATCH = 50_000
 
@@ -48,14 +48,12 @@ def attack(path: Path, index: int, analytical: bool, count: int, seed: int) -> d
     artifact = read_artifact(path, Certificate if kind.name == "certificate" else Library)
     tubes, problem = artifact.record.tubes, problem_of(artifact.header.config)
     robot = problem.dynamics
-    if artifact.record.dynamics is not None:
-        robot.load_state_dict({k: torch.as_tensor(v) for k, v in artifact.record.dynamics.items()})
-        robot.requires_grad_(False)
+    parents = {parent.role: path.parent / parent.path for parent in artifact.header.parents}
+    if "dynamics" in parents:
+        robot_from(read_artifact(parents["dynamics"], DynamicsModel), robot).requires_grad_(False)
     if analytical:
         tubes, robot = artifact.record.true_model.tubes, robot.analytical
-    tracker = Tracker(**json.loads(artifact.record.tracker_arguments))
-    tracker.load_state_dict({k: torch.as_tensor(v) for k, v in artifact.record.tracker.items()})
-    tracker.requires_grad_(False)
+    tracker = tracker_from(read_artifact(parents["tracker"], TrackerModel)).requires_grad_(False)
     own = torch.as_tensor(tubes.cell_reference) == index
     hull = Tube(torch.as_tensor(tubes.tube_lower)[own], torch.as_tensor(tubes.tube_upper)[own]).hull()
     found = attack_tube(

@@ -63,7 +63,9 @@ def example_of(record: type, rng: np.random.Generator, sizes: dict[str, int]) ->
             case "weights":
                 values[f.name] = {"layers.0.weight": rng.normal(size=(2, 3)), "layers.0.bias": rng.normal(size=2)}
             case "scalar":
-                values[f.name] = {"str": "a text", "int": 7, "float": 0.25, "bool": True}[f.type]
+                values[f.name] = {"str": "a text", "int": 7, "float": 0.25, "bool": True}[
+                    f.type.removesuffix(" | None")
+                ]
             case "group" if meta["many"]:
                 values[f.name] = tuple(example_of(meta["record"], rng, dict(sizes)) for _ in range(2))
             case "group":

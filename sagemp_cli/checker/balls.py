@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.errors import UsageError
 
 try:
@@ -13,14 +14,10 @@ try:
 except ImportError:
     raise UsageError("checking needs python-flint; install it with: pip install 'sagemp[check]'") from None
 
-__all__ = ["BITS", "Unproved", "arb", "arb_mat", "ball", "balls", "ctx", "nearest", "number", "upper_float"]
+__all__ = ["BITS", "arb", "arb_mat", "ball", "balls", "ctx", "nearest", "upper_float"]
 
 BITS = 128
 """Precision of the balls' midpoints; a step's rounding is 2^-75 of that of float64."""
-
-
-class Unproved(Exception):
-    """A part of the claim that could not be proved, in one line."""
 
 
 def ball(value: Any) -> arb:
@@ -29,18 +26,6 @@ def ball(value: Any) -> arb:
     if not math.isfinite(number):
         raise Unproved(f"a number that must be finite is {number}")
     return arb(number)
-
-
-def number(value: Any) -> float:
-    """A number of the config as float64.
-
-    Raises:
-        TypeError: a text, a truth value or anything else.
-        OverflowError: a whole number that float64 cannot hold.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"a number is needed, found something of type {type(value).__name__}")
-    return float(value)
 
 
 def balls(values: Iterable[Any]) -> list[arb]:

@@ -6,22 +6,21 @@ import multiprocessing
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
-from sagemp_cli.checker.balls import BITS, Unproved, arb, ball, ctx, number
-from sagemp_cli.checker.cell import CellClaim, Policy, prove_cell
-from sagemp_cli.checker.counterexample import applies, prove_violation
+from sagemp_cli.checker.balls import BITS, ball, ctx
+from sagemp_cli.checker.cell import CellClaim, prove_cell
+from sagemp_cli.checker.clearance import clearances, goal_margins
+from sagemp_cli.checker.counterexample import Ends, applies, prove_violation
 from sagemp_cli.checker.cover import covered
 from sagemp_cli.checker.document import Document, read_document
-from sagemp_cli.checker.scene import SafeSet, require_known
-from sagemp_cli.config.binding import build, target_class
-from sagemp_cli.dynamics.base import Dynamics
-from sagemp_cli.errors import ArtifactError, SagempError
+from sagemp_cli.checker.loop import Folded
+from sagemp_cli.checker.program import Program
+from sagemp_cli.checker.scene import SafeSet, SetOfConfig
+from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.progress import Progress, Silent
 
 _ULP = 2.0**-52
@@ -59,6 +58,8 @@ class Report:
         answer: VERIFIED if all references are proved, FALSIFIED if a violation is, else UNKNOWN.
         problems: what is wrong with the claim as a whole, one line each.
         findings: one for each reference.
+        counterexamples: of each one its reference, and why it proves nothing; empty if its violation is proved.
+        document: what the file says.
         true_model: of a learned robot, the same about its analytical model; None if the file says nothing of that.
         cells, horizon: how many.
         seconds, proof_seconds: time of this check, and of the proof according to the file.
@@ -70,6 +71,8 @@ class Report:
     answer: str
     problems: tuple[str, ...]
     findings: tuple[Finding, ...]
+    counterexamples: tuple[tuple[int, str], ...]
+    document: Document = field(compare=False)
     true_model: tuple[Finding, ...] | None
     cells: int
     horizon: int
@@ -93,33 +96,16 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
     """
     began = time.perf_counter()
     document = read_document(path)
-    try:
-        dynamics = _dynamics(document.config, document.robot)
-        safe = SafeSet.of(document.config["scene"])
-        with ctx.workprec(BITS):
-            problems = list(_problems(document, dynamics, safe))
-    except (
-        LookupError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        RuntimeError,
-        ImportError,
-        OSError,
-        MemoryError,
-        SagempError,
-    ) as e:
-        raise ArtifactError(f"{path}: /config does not describe a problem ({' '.join(str(e).split())})") from None
-    except Unproved as e:
-        raise ArtifactError(f"{path}: /config: {e}") from None
+    safe, sets = document.safe, document.sets
     tubes, true = document.tubes, None
     work = processes, progress or Silent()
     with ctx.workprec(BITS):
-        found = _findings(document, dynamics, safe, *work, sound=not problems)
-        falsified = not problems and document.verdict == "FALSIFIED" and _falsified(document, dynamics, safe)
+        problems = [*_problems(document, safe, sets), *_unrecorded(document)]
+        found = _findings(document, safe, *work, sound=not problems)
+        replayed = () if problems else _replayed(document, safe, sets)
+        falsified = document.verdict == "FALSIFIED" and _falsified(document, replayed)
         if document.true_model is not None:
-            true = _findings(document.true_model, dynamics, safe, *work, sound=not problems)
+            true = _findings(document.true_model, safe, *work, sound=not problems)
             problems += [
                 f"the analytical model, reference {f.reference}: {f.reason}"
                 for f in true
@@ -133,99 +119,102 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
         answer="VERIFIED" if verified else "FALSIFIED" if falsified else "UNKNOWN",
         problems=tuple(problems),
         findings=found,
+        counterexamples=replayed,
+        document=document,
         true_model=true,
         cells=len(tubes["cell_reference"]),
-        horizon=tubes["references"].shape[1] - 1,
+        horizon=document.horizon,
         seconds=time.perf_counter() - began,
         proof_seconds=sum(float(np.sum(d.tubes["seconds"])) for d in (document, document.true_model) if d is not None),
     )
 
 
+def recheck(path: Path) -> str:
+    """What is wrong with a file, as far as that can be told without making its reach sets again; empty if nothing is.
+
+    Whether the sets are those of its config, the cells cover X_I, the stored tubes begin with their cells, keep clear
+    of the scene, end in the goal and say what the figures say, and whether counterexamples hold. It takes a small part
+    of a check and proves nothing: that the loop stays in the tubes is left out.
+
+    Raises:
+        ArtifactError: as :func:`check`.
+    """
+    document = read_document(path)
+    safe, sets = document.safe, document.sets
+    with ctx.workprec(BITS):
+        for problem in _problems(document, safe, sets):
+            return problem
+        for part in (document, *([] if document.true_model is None else [document.true_model])):
+            tubes = part.tubes
+            claims = [r for r, verdict in enumerate(tubes["verdict"]) if verdict == "SAFE"]
+            for r, reason in _geometry(part, safe, claims)[0].items():
+                if reason:
+                    return f"reference {r}: {reason}"
+            lower, upper = tubes["tube_lower"][:, 0], tubes["tube_upper"][:, 0]
+            if not ((lower <= tubes["cell_lower"]) & (tubes["cell_upper"] <= upper)).all():
+                return "a tube does not begin with its cell"
+        if document.verdict == "FALSIFIED":
+            replayed = _replayed(document, safe, sets)
+            if not _falsified(document, replayed):
+                return next((f"a counterexample: {why}" for _, why in replayed if why), "no counterexample is there")
+    return ""
+
+
 def _findings(
-    document: Document, dynamics: Dynamics, safe: SafeSet, processes: int, progress: Progress, *, sound: bool
+    document: Document, safe: SafeSet, processes: int, progress: Progress, *, sound: bool
 ) -> tuple[Finding, ...]:
     """What is found about every reference; nothing is proved unless the file as a whole is sound."""
-    tubes, count = document.tubes, len(document.tubes["references"])
+    tubes, count = document.tubes, len(document.tubes["verdict"])
     claims = [r for r in range(count) if tubes["verdict"][r] == "SAFE"] if sound else []
-    reasons, margins = _geometry(document, dynamics, safe, claims)
+    reasons, margins = _geometry(document, safe, claims)
     open_ = [r for r in claims if not reasons[r]]
-    for r, reason in _reach_sets(document, dynamics, open_, processes, progress):
+    for r, reason in _reach_sets(document, open_, processes, progress):
         reasons[r] = reasons[r] or reason
     return tuple(_finding(r, tubes["verdict"][r], reasons.get(r), margins.get(r)) for r in range(count))
 
 
-def _dynamics(config: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Dynamics:
-    """The robot; a learned one with the weights that the file holds."""
-    section = config["dynamics"]
-    model = target_class(section, "dynamics")  # from an allow-list of this package's own classes
-    if not issubclass(model, Dynamics):
-        raise TypeError(f"dynamics: {model.__name__} is not a robot model")
-    hidden, stored = section.get("hidden", []), sum(value.size for value in weights.values())
-    if sum(hidden) + sum(a * b for a, b in zip(hidden, hidden[1:], strict=False)) > stored:
-        raise ValueError(
-            f"dynamics.hidden is {hidden}, but the file holds {stored} weights"
-        )  # before room is made for it
-    robot: Dynamics = build(section, "dynamics").double().eval()
-    wanted = robot.state_dict()
-    if weights.keys() != wanted.keys():
-        odd = min(weights.keys() ^ wanted.keys())
-        raise ValueError(f"dynamics: weight '{odd}' is {'not understood' if odd in weights else 'missing'}")
-    for name, value in weights.items():
-        if value.shape != tuple(wanted[name].shape) or value.dtype != np.float64 or not np.isfinite(value).all():
-            raise ValueError(f"dynamics: weight '{name}' must be finite float64 of shape {tuple(wanted[name].shape)}")
-    robot.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-    return robot
-
-
-def _problems(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator[str]:
-    """What is wrong with the claim as a whole: sizes, W, X_I, finite numbers, and the verdict of all."""
-    yield from _problems_of_tubes(document, dynamics, safe)
+def _problems(document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]) -> Iterator[str]:
+    """What is wrong with the claim as a whole: W, X_I, finite numbers, and the verdict of all."""
+    yield from _problems_of_tubes(document, safe, sets)
     follows = _answer(document.tubes["verdict"])
     if document.kind == "certificate" and document.verdict != follows:
         yield f"the verdict is {document.verdict}, but {follows} follows from those of the references"
     true = document.true_model
     if true is not None:
-        yield from (f"the analytical model: {problem}" for problem in _problems_of_tubes(true, dynamics, safe))
+        yield from (f"the analytical model: {problem}" for problem in _problems_of_tubes(true, safe, sets))
         if not np.array_equal(true.tubes["references"], document.tubes["references"]):
             yield "the analytical model: its references are others than the robot's"
+        if len(document.programs) != 1 or not true.programs[0].is_deviating(document.programs[0]):
+            yield "the analytical model: its step is not that of the network with the deviation added to w"
 
 
-def _problems_of_tubes(document: Document, dynamics: Dynamics, safe: SafeSet) -> Iterator[str]:
+def _problems_of_tubes(
+    document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]
+) -> Iterator[str]:  # fmt: skip
     """The same of one claim, without the verdict of all."""
-    tubes, config, n = document.tubes, document.config, dynamics.state_dim
-    sizes = (tubes["references"].shape[2], tubes["control_lower"].shape[2], tubes["references"].shape[1] - 1)
-    wanted = (n, dynamics.control_dim, config["horizon"])
-    if sizes != wanted or (len(document.policy.error_scale), len(document.policy.control_scale)) != wanted[:2]:
-        yield f"the file has {sizes} states, controls and steps, its config {wanted}"
-        return
-    flat = len(dynamics.position)
-    shapes = [len(v) for o in safe.obstacles for v in o[2:] if isinstance(v, list)] + [len(v) for v in safe.workspace]
-    if any(s != flat for s in shapes) or any(len(v) != n for v in safe.goal):
-        yield "the scene does not have the dimensions of the robot's positions and states"
-        return
+    tubes = document.tubes
     for name in ("references", "start_lower", "start_upper", "cell_lower", "cell_upper"):
-        if not np.isfinite(tubes[name]).all():
+        if tubes[name] is not None and not np.isfinite(tubes[name]).all():
             yield f"{name} holds a number that is not finite"
-    start, w = config["start"], config["disturbance"]["radius"]
-    require_known("start", start, "center", "radius")
-    require_known("disturbance", config["disturbance"], "radius")
     try:
-        boxes = [
-            ("W", tubes["disturbance_lower"], tubes["disturbance_upper"], [0.0] * n, w),
-            *(("X_I", a, b, start["center"], start["radius"])
-              for a, b in zip(tubes["start_lower"], tubes["start_upper"], strict=True)),
-        ]  # fmt: skip
-        for name, lower, upper, center, radius in boxes:
-            if not _contains(lower, upper, center, radius):
+        boxes = [("W", tubes["disturbance_lower"], tubes["disturbance_upper"], sets[1])]
+        boxes += [("X_I", a, b, sets[0]) for a, b in zip(tubes["start_lower"], tubes["start_upper"], strict=True)]
+        for name, lower, upper, given in boxes:
+            pairs = zip(lower, upper, sides(given), strict=True)
+            if not all(ball(a) <= low and high <= ball(b) for a, b, (low, high) in pairs):
                 yield f"{name} of the file does not contain that of its config"
                 break
     except Unproved as e:
         yield str(e)
     if tuple(tubes["constraint_names"]) != safe.names:
         yield f"the constraints are {', '.join(safe.names)}, the file names {', '.join(tubes['constraint_names'])}"
-    if not document.operations and "SAFE" in tubes["verdict"]:
+
+
+def _unrecorded(document: Document) -> Iterator[str]:
+    """Of tubes that are claimed and cannot be made again, why not."""
+    if not document.relaxations and "SAFE" in document.tubes["verdict"]:
         yield (
-            f"the tubes were made by propagator '{document.propagator}', which records no relaxations: "
+            f"the tubes were made by propagator '{document.said['propagator']}', which records no relaxations: "
             f"they cannot be checked"
         )
 
@@ -236,31 +225,22 @@ def _answer(verdicts: Sequence[str]) -> str:
     return "VERIFIED" if verdicts and all(v == "SAFE" for v in verdicts) else "UNKNOWN"
 
 
-def _contains(lower: np.ndarray, upper: np.ndarray, center: Sequence[Any], radius: Sequence[Any]) -> bool:
-    """Whether a stored box contains ``center +- radius``, exactly."""
-    if not len(lower) == len(center) == len(radius):
-        return False
-    sides = zip(lower, upper, _sides(center, radius), radius, strict=True)
-    return all(ball(a) <= low and high <= ball(b) and ball(r) >= 0 for a, b, (low, high), r in sides)
-
-
-def _sides(center: Sequence[Any], radius: Sequence[Any]) -> list[tuple[arb, arb]]:
-    """Lower and upper end of ``center +- radius`` in each dimension."""
-    exact = [(ball(number(c)), ball(number(r))) for c, r in zip(center, radius, strict=True)]
-    return [(c - r, c + r) for c, r in exact]
+def sides(given: SetOfConfig) -> Ends:
+    """Lower and upper end of a set in each dimension, exact."""
+    pairs = [(ball(a), ball(b)) for a, b in zip(given.first, given.second, strict=True)]
+    return [(c - r, c + r) for c, r in pairs] if given.around else pairs
 
 
 def _geometry(
-    document: Document, dynamics: Dynamics, safe: SafeSet, claims: Sequence[int]
+    document: Document, safe: SafeSet, claims: Sequence[int]
 ) -> tuple[dict[int, str], dict[int, tuple[dict[str, float], dict[str, float]]]]:
     """Of each reference claimed SAFE what does not hold of cells, scene and figures, and the margins proved."""
-    tubes, index = document.tubes, list(dynamics.position)
+    tubes, index, names = document.tubes, list(document.position), document.state_names
     reasons, margins = {}, {}
     for r in claims:
-        own = (tubes["cell_reference"] == r) & (tubes["cell_begin"] == 0)  # later cells lie in the tubes of these
+        own = tubes["cell_reference"] == r
         lower, upper = tubes["tube_lower"][own], tubes["tube_upper"][own]
         try:
-            _require_heirs(tubes, r)
             start = tubes["start_lower"][r], tubes["start_upper"][r]
             if not covered(*start, tubes["cell_lower"][own], tubes["cell_upper"][own]):
                 raise Unproved("its cells do not cover X_I")
@@ -268,14 +248,14 @@ def _geometry(
                 raise Unproved("its tube is not finite")
             if tubes["step"][r] != -1 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
-            distances = safe.clearances(*(side[..., index].reshape(-1, len(index)) for side in (lower, upper)))
+            distances = clearances(safe, *(side[..., index].reshape(-1, len(index)) for side in (lower, upper)))
             for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
                 if not distance > 0:
                     raise Unproved(f"its tube is not clear of '{name}'")
                 if distance.is_finite() and not ball(stored) <= distance:
                     raise Unproved(f"the clearance to '{name}' is {float(distance):.9g}, the file says {stored:.9g}")
-            goal = safe.goal_margins(lower[:, -1].min(axis=0), upper[:, -1].max(axis=0))
-            for name, margin, stored in zip(dynamics.state_names, goal, tubes["goal_margin"][r], strict=True):
+            goal = goal_margins(safe, lower[:, -1].min(axis=0), upper[:, -1].max(axis=0))
+            for name, margin, stored in zip(names, goal, tubes["goal_margin"][r], strict=True):
                 if margin is None:
                     continue
                 if not margin >= 0:
@@ -286,62 +266,60 @@ def _geometry(
             named = list(zip(safe.names, map(float, distances), strict=True))
             margins[r] = (
                 {name: min(d for other, d in named if other == name) for name in safe.names},
-                {name: float(g) for name, g in zip(dynamics.state_names, goal, strict=True) if g is not None},
+                {name: float(g) for name, g in zip(names, goal, strict=True) if g is not None},
             )
         except Unproved as e:
             reasons[r] = str(e)
     return reasons, margins
 
 
-def _require_heirs(tubes: Mapping[str, Any], r: int) -> None:
-    """Of merged cells: each goes over into one that begins then, within its own stored tube from there on."""
-    lower, upper, horizon = tubes["tube_lower"], tubes["tube_upper"], tubes["references"].shape[1] - 1
-    for c in np.flatnonzero(tubes["cell_reference"] == r):
-        begin, end, heir = (int(tubes[name][c]) for name in ("cell_begin", "cell_end", "cell_heir"))
-        if not 0 <= begin < end <= horizon or (heir < 0) != (end == horizon) or heir >= len(tubes["cell_reference"]):
-            raise Unproved(f"cell {c} does not last from one step to a later one, or its heir is missing")
-        if heir < 0:
-            continue
-        if tubes["cell_reference"][heir] != r or tubes["cell_begin"][heir] != end:
-            raise Unproved(f"cell {c} ends at step {end}, but its heir {heir} does not begin there")
-        if not ((lower[c, end:] <= lower[heir, end:]) & (upper[heir, end:] <= upper[c, end:])).all():
-            raise Unproved(f"the tube of cell {c} does not contain that of its heir {heir}")
-
-
 def _reach_sets(
-    document: Document, dynamics: Dynamics, claims: Sequence[int], processes: int, progress: Progress
+    document: Document, claims: Sequence[int], processes: int, progress: Progress
 ) -> Iterator[tuple[int, str]]:
     """Reference and reason, empty if proved, for each of their cells."""
     owner = document.tubes["cell_reference"]
     cells = np.flatnonzero(np.isin(owner, claims)).tolist()
-    jobs = ((_claim(document, c), (document.config["dynamics"], document.robot), document.policy) for c in cells)
+    jobs = (_claim(document, c) for c in cells)
     with progress.task("checking cells", len(cells)) as task:
         if processes <= 1 or len(cells) < 2:
-            answers = (prove_cell(claim, dynamics, policy) for claim, _, policy in jobs)
-            for c, reason in zip(cells, answers, strict=True):
+            folded = _fold(document.programs)
+            for c, claim in zip(cells, jobs, strict=True):
+                reason = prove_cell(claim, folded)
                 task.advance(1)
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
             return
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(cells)), mp_context=context) as pool:
-            for c, reason in zip(cells, pool.map(_prove_elsewhere, *zip(*jobs, strict=True)), strict=True):
+        with ProcessPoolExecutor(
+            min(processes, len(cells)), mp_context=context, initializer=_begin, initargs=(document.programs,)
+        ) as pool:
+            for c, reason in zip(cells, pool.map(_prove_elsewhere, jobs), strict=True):
                 task.advance(1)
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
 
 
-def _prove_elsewhere(
-    claim: CellClaim, robot: tuple[Mapping[str, Any], Mapping[str, np.ndarray]], policy: Policy
-) -> str:
-    torch.set_num_threads(1)
-    section, weights = robot
-    return prove_cell(claim, _dynamics({"dynamics": section}, weights), policy)
+_FOLDED: list[Folded] = []
+"""Of a worker process: its programs."""
+
+
+def _fold(programs: Sequence[Program]) -> list[Folded]:
+    with ctx.workprec(BITS):
+        return [Folded.of(program) for program in programs]
+
+
+def _begin(programs: Sequence[Program]) -> None:
+    _FOLDED[:] = _fold(programs)
+
+
+def _prove_elsewhere(claim: CellClaim) -> str:
+    return prove_cell(claim, _FOLDED)
 
 
 def _claim(document: Document, c: int) -> CellClaim:
     tubes, found = document.tubes, document.relaxations
-    r, heir = tubes["cell_reference"][c], int(tubes["cell_heir"][c])
+    r = tubes["cell_reference"][c]
     return CellClaim(
-        reference=tubes["references"][r],
+        program=document.step_program,
+        windows=document.windows(r),
         lower=tubes["cell_lower"][c],
         upper=tubes["cell_upper"][c],
         tube_lower=tubes["tube_lower"][c],
@@ -350,16 +328,12 @@ def _claim(document: Document, c: int) -> CellClaim:
         control_upper=tubes["control_upper"][r],
         disturbance_lower=tubes["disturbance_lower"],
         disturbance_upper=tubes["disturbance_upper"],
-        operations=document.operations,
         slope=found["slope"][c],
         offset=found["offset"][c],
         radius=found["radius"][c],
+        direction=found["direction"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
-        begin=int(tubes["cell_begin"][c]),
-        end=int(tubes["cell_end"][c]),
-        heir_lower=None if heir < 0 else tubes["cell_lower"][heir],
-        heir_upper=None if heir < 0 else tubes["cell_upper"][heir],
     )
 
 
@@ -372,15 +346,20 @@ def _finding(
     return Finding(r, claimed, not reason, reason, clearance, goal)
 
 
-def _falsified(document: Document, dynamics: Dynamics, safe: SafeSet) -> bool:
+def _replayed(document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]) -> tuple[tuple[int, str], ...]:
+    """Of each counterexample its reference, and why it proves nothing; empty if its violation is proved."""
+    ends = sides(sets[0]), sides(sets[1])
+    out = []
+    for example in document.counterexamples:
+        if not applies(example, document):
+            out.append((-1, "it has not the fields and shapes of a counterexample to one of the references"))
+        else:
+            out.append((int(example["reference"]), prove_violation(document, example, ends, safe)))
+    return tuple(out)
+
+
+def _falsified(document: Document, replayed: Sequence[tuple[int, str]]) -> bool:
     """Whether there are references that the file calls UNSAFE, each with a counterexample whose violation is proved."""
-    start, w = document.config["start"], document.config["disturbance"]["radius"]
-    sets = _sides(start["center"], start["radius"]), _sides([0.0] * len(w), w)
-    refuted = {
-        int(e["reference"])
-        for e in document.counterexamples
-        if applies(e, document.tubes)
-        and not prove_violation(e, document.tubes, *sets, dynamics=dynamics, policy=document.policy, safe=safe)
-    }
+    refuted = {r for r, reason in replayed if not reason}
     unsafe = {r for r, v in enumerate(document.tubes["verdict"]) if v == "UNSAFE"}
     return bool(unsafe) and refuted >= unsafe

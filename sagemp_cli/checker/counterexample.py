@@ -7,74 +7,95 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.checker.balls import Unproved, arb, balls, ctx
-from sagemp_cli.checker.cell import Loop, Policy
-from sagemp_cli.checker.form import Form, Step, array_of
+from sagemp_cli.checker.balls import arb, balls, ctx
+from sagemp_cli.checker.document import Document
+from sagemp_cli.checker.points import Point, outputs_at
+from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet
-from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.checker.unproved import Unproved
 
-_BITS = 512  # a rollout has no other errors than rounding, which the loop may amplify
+BITS = 512  # a rollout has no other errors than rounding, which the loop may amplify
+
+Ends = Sequence[tuple[arb, arb]]
 
 
-def prove_violation(
-    example: Mapping[str, Any],
-    tubes: Mapping[str, Any],
-    start: Sequence[tuple[arb, arb]],
-    disturbance: Sequence[tuple[arb, arb]],
-    *,
-    dynamics: Dynamics,
-    policy: Policy,
-    safe: SafeSet,
-) -> str:
+def replay(
+    programs: Sequence[Program], start: Sequence[float] | Point, disturbances: Sequence[Any], windows: np.ndarray
+) -> list[Point]:
+    """The states of a rollout, ``x_0, ..., x_k`` for k disturbances, as balls that contain them.
+
+    It needs nothing but programs and numbers and can stand beside any other replay.
+
+    Args:
+        programs: the step of each k.
+        start: x_0, taken as exact if it is of float64 numbers.
+        disturbances: w_0, ..., w_{k-1}, likewise.
+        windows: numbers of each step, ``(K, g)``.
+    """
+    with ctx.workprec(BITS):
+        states = [_exact(start)]
+        for k, w in enumerate(disturbances):
+            inputs = {"state": states[-1], "disturbance": _exact(w), "numbers": balls(windows[k])}
+            states.append(outputs_at(programs[k], inputs)["next"])
+        return states
+
+
+def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[Ends, Ends], safe: SafeSet) -> str:
     """Prove that a rollout from X_I under disturbances in W leaves the safe set or misses the goal.
 
     The start and the disturbances are taken from the record as exact numbers, nothing else is. The boxes stored beside
     the tubes may be larger than X_I and W: from there everything is moved into the nearest point of those.
 
     Args:
-        example: the record.
-        tubes: references and the stored boxes.
-        start, disturbance: X_I and W of the config, lower and upper end in each dimension.
-        dynamics, policy, safe: the loop and what it must not do.
+        document: the file; of its references the one that the record names.
+        example: the record, which :func:`applies` to it.
+        sets: X_I and W of the config, lower and upper end in each dimension.
+        safe: what the loop must stay in.
 
     Returns:
         Nothing, or in one line what could not be proved.
     """
     r, step, states, disturbances = (example[key] for key in ("reference", "step", "states", "disturbances"))
+    tubes, last = document.tubes, document.horizon
     try:
-        reference = tubes["references"][r]
-        first, last = states[0], len(reference) - 1
+        first = states[0]
         if not ((tubes["start_lower"][r] <= first) & (first <= tubes["start_upper"][r])).all():
             raise Unproved("it does not start in X_I")
         inside = (tubes["disturbance_lower"] <= disturbances) & (disturbances <= tubes["disturbance_upper"])
-        if disturbances.shape != (last, len(first)) or not inside.all() or not 0 <= step <= last:
-            raise Unproved("its disturbances are not in W, or its step is not one of the horizon")
-        with ctx.workprec(_BITS):
-            loop, x = Loop(dynamics, policy, reference), _moved(first, start)
-            for k in range(int(step)):
-                w = _moved(disturbances[k], disturbance)
-                now = Step(None, w, w)
-                form = Form(now, array_of([now.constant(c) for c in x]))
-                after = dynamics.step(form, loop.control(now, k, form), now.disturbance)
-                x = [s.row[0, 0] for s in after.values]
-            return "" if _violates(x, dynamics, safe, at_end=int(step) == last) else "the replay violates nothing"
+        if not inside.all():
+            raise Unproved("its disturbances are not in W")
+        if not 0 <= step <= last:
+            raise Unproved(f"its step {step} is none of the horizon {last}")
+        with ctx.workprec(BITS):
+            programs = [document.programs[i] for i in document.step_program]
+            x0, w = _moved(first, sets[0]), [_moved(row, sets[1]) for row in disturbances[: int(step)]]
+            x = replay(programs, x0, w, document.windows(r))[-1]
+            if _violates(x, document.position, safe, at_end=int(step) == last):
+                return ""
+            raise Unproved(f"its replay violates nothing for certain at step {int(step)}")
     except (Unproved, ArithmeticError) as e:
         return str(e)
 
 
-def _moved(point: np.ndarray, box: Sequence[tuple[arb, arb]]) -> list[arb]:
+def _exact(values: Sequence[Any]) -> Point:
+    return [v if isinstance(v, arb) else balls([v])[0] for v in values]
+
+
+def _moved(point: np.ndarray, box: Ends) -> Point:
     """The nearest point of a box."""
     return [x.max(low).min(high) for x, (low, high) in zip(balls(point), box, strict=True)]
 
 
-def _violates(x: list[arb], dynamics: Dynamics, safe: SafeSet, *, at_end: bool) -> bool:
-    p = [x[i] for i in dynamics.position]
-    outside = any(c < a or c > b for c, a, b in zip(p, *safe.workspace, strict=True))
-    missed = at_end and any(c < a or c > b for c, a, b in zip(x, *safe.goal, strict=True))
-    return outside or missed or any(_hits(p, o[1:]) for o in safe.obstacles)
+def _violates(x: Point, position: Sequence[int], safe: SafeSet, *, at_end: bool) -> bool:
+    p = [x[i] for i in position]
+    if any(c < a or c > b for c, a, b in zip(p, *safe.workspace, strict=True)) if safe.workspace else False:
+        return True
+    if any(c < a or c > b for c, a, b in zip(x, *safe.goal, strict=True)) if safe.goal and at_end else False:
+        return True
+    return any(_hits(p, o[1:]) for o in safe.obstacles)
 
 
-def _hits(p: list[arb], shape: tuple[str, list[float], Any]) -> bool:
+def _hits(p: Point, shape: tuple[str, list[float], Any]) -> bool:
     kind, first, second = shape
     if kind == "block":
         return all(c >= a and c <= b for c, a, b in zip(p, first, second, strict=True))
@@ -82,16 +103,17 @@ def _hits(p: list[arb], shape: tuple[str, list[float], Any]) -> bool:
     return bool(total <= arb(second) ** 2)
 
 
-def applies(example: Mapping[str, Any], tubes: Mapping[str, Any]) -> bool:
+def applies(example: Mapping[str, Any], document: Document) -> bool:
     """Whether a record has the fields and shapes of a counterexample to one of the references."""
-    count, rows, n = tubes["references"].shape
+    tubes = document.tubes
+    _, rows, n = tubes["tube_lower"].shape
     states, w, reference = (example.get(key) for key in ("states", "disturbances", "reference"))
     return (
         isinstance(states, np.ndarray)
         and isinstance(w, np.ndarray)
         and states.shape == (rows, n)
-        and w.shape == (rows - 1, n)
+        and w.shape == (rows - 1, len(tubes["disturbance_lower"]))
         and isinstance(reference, int | np.integer)
-        and 0 <= reference < count
+        and 0 <= reference < len(tubes["verdict"])
         and isinstance(example.get("step"), int | np.integer)
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +11,18 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sagemp_cli.checker.cell import Policy
+from sagemp_cli.checker.program import Instruction, Program
+from sagemp_cli.checker.scene import SafeSet, SetOfConfig
+from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reading.plain_yaml import plain_yaml
 from sagemp_cli.reading.reader import read_tree
 from sagemp_cli.reading.tree import Dataset, Group
 from sagemp_cli.storage.content import ContentError, content_hash
 
-KINDS = {"sagemp/certificate": 1, "sagemp/library": 1}
-"""Schemas that can be checked, with the newest version of their format that is known here."""
+KINDS = {"sagemp/certificate": 2, "sagemp/library": 2}
+"""Schemas that can be checked, with the version of their format."""
+_COMMANDS = {"sagemp/certificate": "verify", "sagemp/library": "build-library"}
 
 
 @dataclass(frozen=True)
@@ -30,31 +32,56 @@ class Document:
     Attributes:
         kind: ``certificate`` or ``library``.
         config: the resolved config.
-        tubes: datasets of ``/data/tubes`` by name, texts as lists of str.
-        propagator, rigorous: what made the tubes.
-        operations: names and numbers of entries of the recorded relaxations; empty if none are recorded.
-        relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``.
-        policy: the tracker.
-        robot: weights of a learned robot by name; empty for one of formulas.
+        said: what the file says of itself beside its claim: experiment, stage, version, propagator and the like.
+        tubes: datasets of ``/data/tubes`` by name, texts as lists of str; ``references`` is None if there are none.
+        relaxations: ``slope, offset, radius (cells, K, E)``, ``direction (cells, K, A, 2)`` and perhaps ``kept``; empty
+            if none are recorded.
+        programs: the step, one program or several.
+        step_program: which of them each step is, ``(K,)``.
+        lookahead: N; 0 if the step has no numbers of its own.
+        state_names, state_units, control_names, control_units: n and m texts each.
+        position: entries of the state that are the position in the scene.
+        safe: the scene of the config.
+        sets: X_I and W of the config.
+        dt: seconds between samples, as the file says; None if it does not.
         verdict: of a certificate; empty for a library.
         counterexamples: attributes and datasets of each.
         deviation: of a learned robot from its analytical model, ``(R, K, n)``, if the claim is about that model.
-        true_model: a learned robot's claim about its analytical model; the same file, other tubes.
+        true_model: a learned robot's claim about its analytical model; the same file, other tubes and another program.
     """
 
     kind: str
     config: Mapping[str, Any]
+    said: Mapping[str, Any]
     tubes: Mapping[str, Any]
-    propagator: str
-    rigorous: bool
-    operations: tuple[tuple[str, int], ...]
-    relaxations: Mapping[str, np.ndarray]
-    policy: Policy
-    robot: Mapping[str, np.ndarray]
+    relaxations: dict[str, np.ndarray]
+    programs: tuple[Program, ...]
+    step_program: np.ndarray
+    lookahead: int
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    control_names: tuple[str, ...]
+    control_units: tuple[str, ...]
+    position: tuple[int, ...]
+    safe: SafeSet
+    sets: tuple[SetOfConfig, SetOfConfig]
+    dt: float | None
     verdict: str
     counterexamples: tuple[Mapping[str, Any], ...]
     deviation: np.ndarray | None = None
     true_model: Document | None = None
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps K."""
+        return len(self.step_program)
+
+    def windows(self, r: int) -> np.ndarray:
+        """The numbers of each step on a reference: ``p_{k+1}, ..., p_{k+N}``, padded with ``p_K``; ``(K, N n)``."""
+        if not self.lookahead:
+            return np.zeros((self.horizon, 0))
+        index = np.arange(self.horizon)[:, None] + np.arange(1, self.lookahead + 1)
+        return self.tubes["references"][r][np.minimum(index, self.horizon)].reshape(self.horizon, -1)
 
 
 def read_document(path: Path) -> Document:
@@ -94,6 +121,11 @@ def _read(file: Group, path: Path) -> Document:
         raise ArtifactError(
             f"{path}: format {version} of '{schema}' is newer than this checker knows (up to {KINDS[schema]})"
         )
+    if version < KINDS[schema]:
+        raise ArtifactError(
+            f"{path}: format {version} of '{schema}' does not carry its step as a program; "
+            f"make it again with 'sagemp {_COMMANDS[schema]} --overwrite'"
+        )
     stored = str(file.attrs.get("content_sha256", ""))
     if not stored:
         raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
@@ -101,27 +133,150 @@ def _read(file: Group, path: Path) -> Document:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
     config = _config(file["config"][()])
     data = file["data"]
-    weights = {name: _dataset(d) for name, d in data["tracker"].items()}
+    _require_known(data, "tubes", "loop", "counterexamples", "true_model", "samples", *_REJECTED)
     examples = data.get("counterexamples", {})
+    tubes = _tubes(data["tubes"], path)
+    _, rows, n = tubes["tubes"]["tube_lower"].shape
+    d = len(tubes["tubes"]["disturbance_lower"])
+    loop = _loop(data["loop"], n, d, rows - 1)
     document = Document(
         kind=schema.removeprefix("sagemp/"),
         config=config,
-        **_tubes(data["tubes"], path),
-        policy=_policy(weights, _arguments(data.attrs["tracker_arguments"])),
-        robot={name: _dataset(d) for name, d in data.get("dynamics", {}).items()},
+        said={name: _plain(file.attrs[name]) for name in _SAID if name in file.attrs}
+        | tubes.pop("said")
+        | {f"further plans {name}": _plain(data["samples"].attrs[name]) for name in _SAMPLES if "samples" in data},
+        **tubes,
+        **loop,
+        **_problem(config, n, d, loop, path),
         verdict=str(data.attrs.get("verdict", "")),
         counterexamples=tuple(
             {**examples[name].attrs, **{key: _dataset(d) for key, d in examples[name].items()}} for name in examples
         ),
     )
+    _require_fitting(document, path)
     if "true_model" not in data:
         return document
-    true = dataclasses.replace(document, **_tubes(data["true_model/tubes"], path))
-    deviation, shape = _dataset(data["true_model/deviation"]), true.tubes["references"].shape
-    wanted = (shape[0], shape[1] - 1, shape[2])
-    if not document.robot or deviation.shape != wanted or deviation.dtype != np.float64:
-        raise ArtifactError(f"{path}: /data/true_model needs a learned robot and a float64 deviation of shape {wanted}")
-    return dataclasses.replace(document, true_model=dataclasses.replace(true, deviation=deviation))
+    true = _tubes(data["true_model/tubes"], path)
+    true.pop("said")
+    program = _program(data["true_model/program"], n, d, document.lookahead * n)
+    true = dataclasses.replace(
+        document, **true, programs=(program,), step_program=np.zeros(document.horizon, np.int64),
+        deviation=_dataset(data["true_model/deviation"]),
+    )  # fmt: skip
+    _require_fitting(true, path)
+    wanted = (len(true.tubes["verdict"]), true.horizon, n)
+    if true.deviation.shape != wanted or true.deviation.dtype != np.float64 or program.deviation < 0:
+        raise ArtifactError(
+            f"{path}: /data/true_model needs a program with a deviation, and float64 bounds of shape {wanted}"
+        )
+    return dataclasses.replace(document, true_model=true)
+
+
+_REJECTED = ("rejected_references", "rejected_reason", "reason_names", "reason_counts")
+"""Of a library: what was sampled and not certified."""
+_SAMPLES = ("drawn", "certified")
+_SAID = ("experiment", "stage", "status", "version", "created_utc", "seconds")
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
+def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
+    """What a group says of the loop, as fields of a :class:`Document`."""
+    _require_known(group, "programs", "step_program", "position", *_NAMES)
+    lookahead = int(group.attrs["lookahead"])
+    if not 0 <= lookahead <= _MOST_LOOKAHEAD:
+        raise ValueError(f"/data/loop: lookahead is {lookahead}")
+    programs = group["programs"]
+    made = tuple(_program(programs[name], n, d, lookahead * n) for name in sorted(programs))
+    if not made:
+        raise ValueError("/data/loop needs a program")
+    which, position = _dataset(group["step_program"]), _dataset(group["position"])
+    if which.shape != (steps,) or not np.isin(which, np.arange(len(made))).all() or which.dtype != np.int64:
+        raise ValueError(f"/data/loop/step_program must be {steps} numbers of its {len(made)} programs")
+    if position.ndim != 1 or position.dtype != np.int64 or not np.isin(position, np.arange(n)).all():
+        raise ValueError(f"/data/loop/position must be entries of {n} states")
+    if len(set(position.tolist())) != len(position):
+        raise ValueError("/data/loop/position names a state twice")
+    m = made[0].controls
+    if any(program.controls != m for program in made):
+        raise ValueError("/data/loop: its programs have different numbers of controls")
+    names = {name: tuple(_dataset(group[name])) for name in _NAMES}
+    longest = max((len(text) for texts in names.values() for text in texts), default=0)
+    if [len(v) for v in names.values()] != [n, n, m, m] or longest > _LONGEST_NAME:
+        raise ValueError(f"/data/loop must name {n} states and {m} controls and their units, in short words")
+    for name in ("state_names", "control_names"):
+        if len(set(names[name])) != len(names[name]):
+            raise ValueError(f"/data/loop/{name} has a name twice")
+    return {
+        "programs": made,
+        "step_program": which,
+        "lookahead": lookahead,
+        **names,
+        "position": tuple(position.tolist()),
+        "dt": float(group.attrs["dt"]) if "dt" in group.attrs else None,
+    }
+
+
+def _problem(config: Any, n: int, d: int, loop: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Scene, X_I and W of a config, if they can be read in one way only and fit the loop."""
+    steps = len(loop["step_program"])
+    try:
+        safe = SafeSet.of(config.get("scene"))
+        safe.require_sizes(len(loop["position"]), n)
+        sets = SetOfConfig.of("start", config["start"], n), SetOfConfig.of("disturbance", config["disturbance"], d)
+        if config["horizon"] != steps or isinstance(config["horizon"], bool):
+            raise Unproved(f"the horizon is {config['horizon']}, the tubes have {steps} steps")
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
+        raise ArtifactError(f"{path}: /config does not describe a problem ({' '.join(str(e).split())})") from None
+    except Unproved as e:
+        raise ArtifactError(f"{path}: /config: {e}") from None
+    return {"safe": safe, "sets": sets}
+
+
+def _program(group: Group, n: int, d: int, g: int) -> Program:
+    """A program as stored; instruction i has the parts ``begin[i]..begin[i+1]`` of each list."""
+    lists = (("operands", "operand_begin"), ("numbers", "number_begin"), ("indices", "index_begin"))
+    _require_known(group, "kinds", "sizes", "outputs", *(name for pair in lists for name in pair))
+    kinds = _dataset(group["kinds"])
+    parts = [
+        _parts(group, name, begin, np.float64 if name == "numbers" else np.int64, len(kinds)) for name, begin in lists
+    ]
+    instructions = [
+        Instruction(kind, tuple(reads.tolist()), constants, entries)
+        for kind, reads, constants, entries in zip(kinds, *parts, strict=True)
+    ]
+    outputs = _dataset(group["outputs"])
+    if outputs.shape != (3,) or outputs.dtype != np.int64:
+        raise ValueError(f"{group.name}/outputs must be three slots")
+    named = zip(("next", "control", "deviation"), outputs.tolist(), strict=True)
+    numbers = len(kinds) > 2 and kinds[2] == "numbers"
+    if bool(g) != numbers:
+        raise ValueError(
+            f"{group.name}: the step needs {'' if g else 'no '}numbers in slot 2, as it looks ahead or not"
+        )
+    program = Program.of(
+        instructions, {name: slot for name, slot in named if slot != -1 or name == "next"},
+        states=n, disturbances=d, numbers=g,
+    )  # fmt: skip
+    if _dataset(group["sizes"]).tolist() != list(program.widths):
+        raise ValueError(f"{group.name}/sizes are not those of its instructions' results")
+    return program
+
+
+def _parts(group: Group, name: str, begin: str, kind: type, count: int) -> list[np.ndarray]:
+    values, ends = _dataset(group[name]), _dataset(group[begin])
+    if values.ndim != 1 or values.dtype != kind or ends.shape != (count + 1,) or ends.dtype != np.int64:
+        raise ValueError(f"{group.name}/{name} must be a list of {kind.__name__} with {count + 1} places in {begin}")
+    if ends[0] != 0 or ends[-1] != len(values) or (np.diff(ends) < 0).any():
+        raise ValueError(f"{group.name}/{begin} does not take {name} apart")
+    return [values[a:b] for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
+
+
+_NAMES = ("state_names", "state_units", "control_names", "control_units")
+_MOST_LOOKAHEAD = 10_000
+_LONGEST_NAME = 60
 
 
 def _config(text: str) -> Any:
@@ -132,31 +287,27 @@ def _config(text: str) -> Any:
     return config
 
 
-def _arguments(text: str) -> Any:
-    """The tracker's arguments, likewise."""
-    arguments = json.loads(text)
-    if json.dumps(arguments) != text:
-        raise ValueError("its tracker's arguments are not written as sagemp writes them, and could be misread")
-    return arguments
-
-
 def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
     """What a group of tubes holds, as fields of a :class:`Document`."""
+    _require_known(tubes, "references", "relaxations", *_SHAPES, *_TEXTS)
     read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], Dataset)}
+    read.setdefault("references", None)
     _require_shapes(read, path)
-    relaxations, operations = {}, ()
+    relaxations = {}
     if "relaxations" in tubes:
-        group = tubes["relaxations"]
-        relaxations = {name: _dataset(group[name]) for name in group}
-        operations = tuple(zip(relaxations["operations"], map(int, relaxations["widths"]), strict=True))
-        _require_relaxations(relaxations, operations, read, path)
+        _require_known(tubes["relaxations"], "slope", "offset", "radius", "direction", "kept")
+        relaxations = {name: _dataset(node) for name, node in tubes["relaxations"].items()}
     return {
         "tubes": read,
-        "propagator": str(tubes.attrs["propagator"]),
-        "rigorous": bool(tubes.attrs["rigorous"]),
-        "operations": operations,
+        "said": {name: _plain(tubes.attrs[name]) for name in ("propagator", "rigorous")},
         "relaxations": relaxations,
     }
+
+
+def _require_known(group: Group, *names: str) -> None:
+    """Refuse what would be there and neither be proved nor understood."""
+    if not set(group) <= set(names):
+        raise ValueError(f"{group.name} holds '{min(set(group) - set(names))[:40]}', which no certificate does")
 
 
 def _dataset(dataset: Dataset) -> Any:
@@ -164,11 +315,10 @@ def _dataset(dataset: Dataset) -> Any:
 
 
 _SHAPES = {
-    "references": "R K+1 n",
     "start_lower": "R n",
     "start_upper": "R n",
-    "disturbance_lower": "n",
-    "disturbance_upper": "n",
+    "disturbance_lower": "d",
+    "disturbance_upper": "d",
     "cell_reference": "C",
     "cell_lower": "C n",
     "cell_upper": "C n",
@@ -181,75 +331,56 @@ _SHAPES = {
     "step": "R",
     "seconds": "R",
 }
-_MERGED = {"cell_begin": "C", "cell_end": "C", "cell_heir": "C"}
-"""There together or not at all."""
 _TEXTS = {"verdict": "R", "constraint": "R", "constraint_names": "constraints"}
 
 
-def _require_shapes(tubes: dict[str, Any], path: Path) -> None:
-    count, rows, n = tubes["references"].shape
-    sizes = {"R": count, "K+1": rows, "K": rows - 1, "n": n, "C": len(tubes["cell_reference"])}
+def _require_shapes(tubes: Mapping[str, Any], path: Path) -> None:
+    cells, rows, n = tubes["tube_lower"].shape
+    sizes = {"R": len(tubes["verdict"]), "K+1": rows, "K": rows - 1, "n": n, "C": cells}
     sizes |= {"m": tubes["control_lower"].shape[-1], "constraints": len(tubes["constraint_names"])}
-    if not any(name in tubes for name in _MERGED):
-        cells = len(tubes["cell_reference"])
-        tubes |= {"cell_begin": np.zeros(cells, np.int64), "cell_end": np.full(cells, rows - 1)}
-        tubes["cell_heir"] = np.full(cells, -1)
-    for name, dims in {**_SHAPES, **_TEXTS, **_MERGED}.items():
+    sizes |= {"d": tubes["disturbance_lower"].size}
+    references = {} if tubes["references"] is None else {"references": "R K+1 n"}
+    for name, dims in {**_SHAPES, **_TEXTS, **references}.items():
         value, wanted = tubes[name], tuple(sizes[d] for d in dims.split())
         shape = (len(value),) if name in _TEXTS else value.shape
-        integer = name in ("cell_reference", "step", *_MERGED)
-        kind = str if name in _TEXTS else np.int64 if integer else np.float64
+        kind = str if name in _TEXTS else np.int64 if name in ("cell_reference", "step") else np.float64
         right = all(isinstance(v, str) for v in value) if name in _TEXTS else value.dtype == kind
         if shape != wanted or not right:
             raise ArtifactError(f"{path}: /data/tubes/{name} must be {kind.__name__} of shape {wanted}")
-    if rows < 2 or not np.isin(tubes["cell_reference"], np.arange(count)).all():
+    if rows < 2 or not np.isin(tubes["cell_reference"], np.arange(sizes["R"])).all():
         raise ArtifactError(f"{path}: /data/tubes needs at least one step, and cells of its own references")
 
 
-def _require_relaxations(
-    found: Mapping[str, Any], operations: tuple[tuple[str, int], ...], tubes: Mapping[str, Any], path: Path
-) -> None:
+def _require_fitting(document: Document, path: Path) -> None:
+    """Refuse tubes that are not those of the loop: other controls, other relaxations, no reference to look ahead on."""
+    tubes, found = document.tubes, document.relaxations
     cells, rows, _ = tubes["tube_lower"].shape
-    wanted = (cells, rows - 1, sum(width for _, width in operations))
+    if tubes["control_lower"].shape[-1] != document.programs[0].controls:
+        raise ArtifactError(
+            f"{path}: /data/tubes/control_lower is not of the program's {document.programs[0].controls}"
+        )
+    if document.lookahead and tubes["references"] is None:
+        raise ArtifactError(f"{path}: /data/loop looks {document.lookahead} steps ahead, but there are no references")
+    if not found:
+        return
+    most, angles = (max(count(p) for p in document.programs) for count in (_entries, _angles))
+    wanted = (cells, rows - 1, most)
     for name in ("slope", "offset", "radius"):
-        if found[name].shape != wanted or found[name].dtype != np.float64 or any(w < 1 for _, w in operations):
-            raise ArtifactError(f"{path}: /data/tubes/relaxations/{name} must be float64 of shape {wanted}")
+        if found[name].shape != wanted or found[name].dtype != np.float64:
+            raise ArtifactError(
+                f"{path}: /data/tubes/relaxations/{name} must be float64 of shape {wanted}, the steps' own"
+            )
+    direction = found.setdefault("direction", np.zeros((cells, rows - 1, 0, 2)))
+    if direction.shape != (cells, rows - 1, angles, 2) or direction.dtype != np.float64:
+        raise ArtifactError(f"{path}: /data/tubes/relaxations/direction must be float64 of {angles} angles a step")
     kept = found.get("kept")
     if kept is not None and (kept.shape[:2] != wanted[:2] or kept.ndim != 3 or kept.dtype != np.uint8):
         raise ArtifactError(f"{path}: /data/tubes/relaxations/kept must be uint8 of shape {(*wanted[:2], 'bytes')}")
 
 
-_ARGUMENTS = {"state_dim", "control_dim", "lookahead", "hidden", "negative_slope"}
-_ARGUMENTS |= {"error_scale", "control_scale", "control_offset", "saturate"}
+def _entries(program: Program) -> int:
+    return program.relaxations
 
 
-def _policy(weights: Mapping[str, np.ndarray], arguments: Mapping[str, Any]) -> Policy:
-    """The tracker; of its constructor's arguments ``negative_slope``, ``lookahead`` and ``saturate`` are taken."""
-    unknown = set(arguments) - _ARGUMENTS
-    if unknown:
-        raise ValueError(f"tracker argument '{min(unknown)}' is not understood")
-    depth = sum(name.endswith(".weight") for name in weights)
-    layers = [(weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"]) for i in range(depth)]
-    scales = [weights[name] for name in ("error_scale", "control_scale", "control_offset")]
-    for array in [a for pair in layers for a in pair] + scales:
-        if array.dtype != np.float64 or not np.isfinite(array).all():
-            raise ValueError("tracker weights must be finite float64 numbers")
-    if not isinstance(arguments.get("saturate", False), bool):
-        raise ValueError("tracker argument 'saturate' must be true or false")
-    lookahead, n, m = int(arguments["lookahead"]), len(scales[0]), len(scales[1])
-    widths = [lookahead * n, *(len(b) for _, b in layers)]
-    fits = all(w.shape == (b, a) for (w, _), a, b in zip(layers, widths[:-1], widths[1:], strict=True))
-    fits &= widths[-1] == m == len(scales[2]) and len(weights) == 2 * depth + 3
-    fits &= all(a.ndim == 1 for a in (*(b for _, b in layers), *scales))
-    if depth < 2 or lookahead < 1 or not fits:
-        raise ValueError("tracker weights do not fit each other")
-    return Policy(
-        weights=tuple(w for w, _ in layers),
-        biases=tuple(b for _, b in layers),
-        error_scale=scales[0],
-        control_scale=scales[1],
-        control_offset=scales[2],
-        negative_slope=float(arguments["negative_slope"]),
-        lookahead=lookahead,
-        saturate=arguments.get("saturate", False),
-    )
+def _angles(program: Program) -> int:
+    return sum(count for slot in program.relaxed for kind, count in slot if kind == "atan2")

@@ -8,13 +8,13 @@ until its curvature has one sign, where a tangent and a chord bound it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from sagemp_cli.checker.balls import Unproved, arb, ball
 
 _MOST_SPLITS = 4096
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 16
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Smooth:
     value: Callable[[arb], arb]
     first: Callable[[arb], arb]
     second: Callable[[arb], arb]
+    concave: bool = False  # wherever it is defined, though the second derivative may be infinite at an end
 
     def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
         """See the module."""
@@ -49,7 +50,7 @@ class Smooth:
         least, most = ends[0].min(ends[1]), ends[0].max(ends[1])
         while todo:
             low, high = todo.pop()
-            curvature = self.second(low.union(high))
+            curvature = arb(-1) if self.concave and least.is_finite() else self.second(low.union(high))
             if curvature >= 0:
                 least = least.min(self._tangent(slope, low, high, arb.min))
             elif curvature <= 0:
@@ -77,7 +78,10 @@ class Smooth:
             if bend.contains(0):
                 break
             step = ((self.first(x) - slope) / bend).mid()
-            x = (x - step).max(low).min(high).mid()
+            before, x = x, (x - step).max(low).min(high).mid()
+            if not self.first(x).is_finite():  # at the end of the domain
+                x = ((before + x) / 2).mid()
+                continue
             if abs(step) * ball(2.0**40) <= high - low:
                 break
         at, tilt = self.value(x) - slope * x, self.first(x) - slope
@@ -120,8 +124,8 @@ class Function:
         return found
 
 
-def _smooth(value: Callable, first: Callable, second: Callable) -> Function:
-    return Function(((None, Smooth(value, first, second), None),))
+def _smooth(value: Callable, first: Callable, second: Callable, *, concave: bool = False) -> Function:
+    return Function(((None, Smooth(value, first, second, concave), None),))
 
 
 def _line(a: float, b: float = 0.0) -> Line:
@@ -160,7 +164,7 @@ FUNCTIONS: dict[str, Function] = {
     "silu": _smooth(lambda x: x * _sigmoid(x), _silu_first, _silu_second),
     "exp": _smooth(arb.exp, arb.exp, arb.exp),
     "log": _smooth(arb.log, lambda x: 1 / x, lambda x: -1 / x**2),
-    "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt())),
+    "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt()), concave=True),
     "reciprocal": _smooth(lambda x: 1 / x, lambda x: -1 / x**2, lambda x: 2 / x**3),
     "identity": Function(((None, _line(1.0), None),)),
     "abs": Function(((None, _line(-1.0), 0.0), (0.0, _line(1.0), None))),
@@ -201,13 +205,28 @@ def integer_power(exponent: int) -> Function:
     return _smooth(lambda x: x**p, lambda x: p * x ** (p - 1), lambda x: p * (p - 1) * x ** (p - 2))
 
 
-def clamp(low: float | None, high: float | None) -> Function:
-    """``min(max(x, low), high)``; None is no limit."""
-    if low is not None and high is not None and low > high:
-        raise Unproved("clamp with its limits the wrong way round")
-    pieces: list[Piece] = [(low, _line(1.0), high)]
-    if low is not None:
+def clamp(low: float, high: float) -> Function:
+    """``min(max(x, low), high)``; infinite is no limit; ``high`` where the lower limit is above it."""
+    if low > high:
+        return Function(((None, _line(0.0, high), None),))
+    ends = (low if low > -math.inf else None), (high if high < math.inf else None)
+    pieces: list[Piece] = [(ends[0], _line(1.0), ends[1])]
+    if ends[0] is not None:
         pieces.append((None, _line(0.0, low), low))
-    if high is not None:
+    if ends[1] is not None:
         pieces.append((high, _line(0.0, high), None))
     return Function(tuple(pieces))
+
+
+def function_of(kind: str, constants: Sequence[float]) -> Function:
+    """The function of an instruction that has one operand and is not linear."""
+    made = _WITH_NUMBERS.get(kind)
+    return FUNCTIONS[kind] if made is None else made(*constants)
+
+
+_WITH_NUMBERS: dict[str, Callable[..., Function]] = {
+    "leaky_relu": leaky_relu,
+    "elu": elu,
+    "softplus": softplus,
+    "pow": lambda exponent: integer_power(int(exponent)),
+}

@@ -1,4 +1,4 @@
-"""The safe set: that stored tubes keep clear of obstacles, stay in the workspace and end in the goal."""
+"""The safe set of a certificate, as its config says it: workspace, obstacles, goal; each may be missing."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+from sagemp_cli.checker.unproved import Unproved
 
-from sagemp_cli.checker.balls import Unproved, arb, ball, number
+Corners = tuple[list[float], list[float]]
 
 
 @dataclass(frozen=True)
@@ -16,64 +16,97 @@ class SafeSet:
     """What the config says, as float64 numbers.
 
     Attributes:
-        workspace: lower and upper corner over the position.
-        balls: name, centre and radius; blocks: name, lower and upper corner. Closed sets.
-        order: names of the constraints: the workspace, then the obstacles as the config lists them.
-        goal: lower and upper corner over the state, infinite where there is no face.
+        workspace: lower and upper corner over the position; None if there is none.
+        obstacles: name, kind, and of a ball centre and radius, of a block lower and upper corner. Closed sets.
+        goal: lower and upper corner over the state, infinite where there is no face; None if there is none.
     """
 
-    workspace: tuple[list[float], list[float]]
+    workspace: Corners | None
     obstacles: tuple[tuple[str, str, list[float], Any], ...]
-    goal: tuple[list[float], list[float]]
+    goal: Corners | None
 
     @classmethod
-    def of(cls, scene: Mapping[str, Any]) -> SafeSet:
-        """From the config's ``scene`` section."""
-
-        def box(part: Mapping[str, Any], *more: str) -> tuple[list[float], list[float]]:
-            require_known("scene", part, "lower", "upper", *more)
-            lower, upper = [number(v) for v in part["lower"]], [number(v) for v in part["upper"]]
-            if not all(a <= b for a, b in zip(lower, upper, strict=True)):  # an obstacle that nothing can touch
-                raise Unproved("the scene has a box whose corners are the wrong way round")
-            return lower, upper
-
+    def of(cls, scene: Mapping[str, Any] | None) -> SafeSet:
+        """From the config's ``scene`` section, if it has one."""
+        if scene is None:
+            return cls(None, (), None)
         # Landmarks and what an obstacle looks like are for planners: nothing is proved of them.
         require_known("scene", scene, "workspace", "obstacles", "goal", "name", "description", "landmarks")
-        obstacles = []
-        for i, item in enumerate(scene["obstacles"]):
-            name = str(item.get("name", f"obstacle {i}"))
-            if item["kind"] == "ball":
-                require_known("scene", item, "kind", "name", "object", "center", "radius")
-                center, radius = [number(v) for v in item["center"]], number(item["radius"])
-                if not radius >= 0:
-                    raise Unproved(f"the radius of obstacle '{name}' is {radius}")
-                obstacles.append((name, "ball", center, radius))
-            elif item["kind"] == "block":
-                obstacles.append((name, "block", *box(item, "kind", "name", "object")))
-            else:
-                raise Unproved(f"obstacle '{name}' is of unknown kind '{item['kind']}'")
-        return cls(box(scene["workspace"]), tuple(obstacles), box(scene["goal"]))
+        workspace, goal = (
+            _corners(scene[key]) if scene.get(key) is not None else None for key in ("workspace", "goal")
+        )
+        return cls(workspace, tuple(_obstacle(i, item) for i, item in enumerate(scene.get("obstacles", ()))), goal)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the constraints."""
-        return ("workspace", *(o[0] for o in self.obstacles))
+        """Names of the constraints: the workspace, then the obstacles as the config lists them."""
+        return (*(() if self.workspace is None else ("workspace",)), *(o[0] for o in self.obstacles))
 
-    def clearances(self, lower: np.ndarray, upper: np.ndarray) -> list[arb]:
-        """Of position boxes ``(rows, d)``: the least distance to each constraint (to a block: the largest gap)."""
-        return [
-            _least([_inside(low, high, self.workspace) for low, high in zip(lower, upper, strict=True)]),
-            *(_least([_apart(low, high, o) for low, high in zip(lower, upper, strict=True)]) for o in self.obstacles),
-        ]
+    def require_sizes(self, positions: int, states: int) -> None:
+        """Refuse a scene of other dimensions than the loop's."""
+        sides = [v for o in self.obstacles for v in o[2:] if isinstance(v, list)] + list(self.workspace or ())
+        if any(len(v) != positions for v in sides) or any(len(v) != states for v in self.goal or ()):
+            raise Unproved(f"the scene does not have the dimensions of {positions} positions and {states} states")
+        if self.names and not positions:
+            raise Unproved("the scene has obstacles or a workspace, but no state is a position")
 
-    def goal_margins(self, lower: np.ndarray, upper: np.ndarray) -> list[arb | None]:
-        """Of a state box: how far it is inside each goal face pair, negative outside; None where there is no face."""
-        margins: list[arb | None] = []
-        for a, b, low, high in zip(lower, upper, *self.goal, strict=True):
-            sides = [] if low == -np.inf else [ball(a) - ball(low)]
-            sides += [] if high == np.inf else [ball(high) - ball(b)]
-            margins.append(_least(sides) if sides else None)
-        return margins
+
+@dataclass(frozen=True)
+class SetOfConfig:
+    """X_I or W as the config says it: ``first +- second``, or between the two.
+
+    Attributes:
+        first, second: centre and radius, or lower and upper corner.
+        around: whether they are centre and radius.
+    """
+
+    first: list[float]
+    second: list[float]
+    around: bool
+
+    @classmethod
+    def of(cls, where: str, section: Mapping[str, Any], size: int) -> SetOfConfig:
+        """From ``start`` or ``disturbance``; a disturbance with a radius alone is around 0."""
+        around = "radius" in section
+        keys = ("center", "radius") if around else ("lower", "upper")
+        require_known(where, section, *keys)
+        given = (
+            section if "center" in section or not around or where == "start" else {"center": [0.0] * size, **section}
+        )
+        first, second = ([number(v) for v in given[key]] for key in keys)
+        if len(first) != size or len(second) != size:
+            raise Unproved(f"the {where} has {len(first)} and {len(second)} numbers, {size} are needed")
+        if not all(b >= (0 if around else a) for a, b in zip(first, second, strict=True)):
+            raise Unproved(f"the {where} is a box whose corners are the wrong way round")
+        return cls(first, second, around)
+
+    def corners(self) -> Corners:
+        """Lower and upper corner, rounded to nearest."""
+        if not self.around:
+            return self.first, self.second
+        pairs = list(zip(self.first, self.second, strict=True))
+        return [c - r for c, r in pairs], [c + r for c, r in pairs]
+
+
+def _corners(part: Mapping[str, Any], *more: str) -> Corners:
+    require_known("scene", part, "lower", "upper", *more)
+    lower, upper = [number(v) for v in part["lower"]], [number(v) for v in part["upper"]]
+    if not all(a <= b for a, b in zip(lower, upper, strict=True)):  # an obstacle that nothing can touch
+        raise Unproved("the scene has a box whose corners are the wrong way round")
+    return lower, upper
+
+
+def _obstacle(i: int, item: Mapping[str, Any]) -> tuple[str, str, list[float], Any]:
+    name = str(item.get("name", f"obstacle {i}"))
+    if item["kind"] == "ball":
+        require_known("scene", item, "kind", "name", "object", "center", "radius")
+        center, radius = [number(v) for v in item["center"]], number(item["radius"])
+        if not radius >= 0:
+            raise Unproved(f"the radius of obstacle '{name}' is {radius}")
+        return name, "ball", center, radius
+    if item["kind"] == "block":
+        return name, "block", *_corners(item, "kind", "name", "object")
+    raise Unproved(f"obstacle '{name}' is of unknown kind '{item['kind']}'")
 
 
 def require_known(where: str, part: Mapping[str, Any], *keys: str) -> None:
@@ -82,30 +115,13 @@ def require_known(where: str, part: Mapping[str, Any], *keys: str) -> None:
         raise Unproved(f"the {where} says '{min(set(part) - set(keys))}', which is not understood")
 
 
-def _least(values: list[arb]) -> arb:
-    out = values[0]
-    for v in values[1:]:
-        out = out.min(v)
-    return out
+def number(value: Any) -> float:
+    """A number of the config as float64.
 
-
-def _inside(lower: np.ndarray, upper: np.ndarray, box: tuple[list[float], list[float]]) -> arb:
-    low, high = box
-    if len(low) != len(lower) or len(high) != len(upper):
-        raise Unproved("the workspace has the wrong number of dimensions")
-    sides = [ball(a) - ball(c) for a, c in zip(lower, low, strict=True) if c != -np.inf]
-    sides += [ball(c) - ball(b) for b, c in zip(upper, high, strict=True) if c != np.inf]
-    return _least(sides) if sides else arb("inf")
-
-
-def _apart(lower: np.ndarray, upper: np.ndarray, obstacle: tuple[str, str, list[float], Any]) -> arb:
-    _, kind, first, second = obstacle
-    if kind == "block":
-        gaps = [
-            (ball(c) - ball(b)).max(ball(a) - ball(d)) for a, b, c, d in zip(lower, upper, first, second, strict=True)
-        ]
-        return -_least([-g for g in gaps])
-    total = arb(0)
-    for a, b, c in zip(lower, upper, first, strict=True):
-        total += (ball(a) - ball(c)).max(ball(c) - ball(b)).max(arb(0)) ** 2
-    return total.sqrt() - ball(second)
+    Raises:
+        TypeError: a text, a truth value or anything else.
+        OverflowError: a whole number that float64 cannot hold.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"a number is needed, found something of type {type(value).__name__}")
+    return float(value)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = examples(
     "sagemp inspect artifacts/unicycle_node/certificate.h5",
+    "sagemp inspect certificate.h5 --equations",
     "sagemp inspect artifacts/unicycle_node/library.h5 --json",
 )
 
@@ -24,16 +25,33 @@ EXAMPLES = examples(
 def inspect(
     file: Annotated[Path, typer.Argument(help="An artifact, i.e. an HDF5 file that a stage wrote.")],
     as_json: Json = False,
+    equations: Annotated[
+        bool,
+        typer.Option("--equations", help="Show the step of a certificate or a library as equations, nothing else."),
+    ] = False,
+    config: Annotated[bool, typer.Option("--config", help="Print the config in the file, nothing else.")] = False,
 ) -> None:
     """Show what an artifact is, how and from what it was made, and what it holds.
 
     Everything is read and checked against the declaration of its kind; the content and the files that it was made
-    from are compared by hash.
+    from are compared by hash. Of a certificate or a library the claim is printed in full: what 'sagemp check' would
+    prove, and what the file only says of itself.
     """
-    from sagemp_cli.storage import read_any_artifact
+    from sagemp_cli.storage import open_header, read_any_artifact
 
+    if equations:
+        from sagemp_cli.checker.claim import equation_lines
+        from sagemp_cli.checker.document import read_document
+
+        typer.echo(printable("\n".join(equation_lines(read_document(file)))))
+        return
+    if config:
+        import yaml
+
+        typer.echo(printable(yaml.safe_dump(dict(open_header(file)[1].config), sort_keys=True)), nl=False)
+        return
     kind, artifact = read_any_artifact(file)
-    content = describe(kind, artifact)
+    content = describe(kind, artifact) | {"claim": _claim(kind, file)}
     if as_json:
         typer.echo(json.dumps(content, indent=2))
     else:
@@ -55,7 +73,6 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
         "created_utc": header.created_utc,
         "seconds": header.seconds,
         "version": header.version,
-        "device": header.device,
         "packages": dict(header.packages),
         "parents": [
             {"role": p.role, "file": p.path, "sha256": p.sha256, "now": _now(artifact.path.parent / p.path, p.sha256)}
@@ -64,6 +81,21 @@ def describe(kind: Kind, artifact: Artifact[Any]) -> dict[str, Any]:
         "fields": list(_fields(artifact.record, "")),
         "verdicts": _verdicts(artifact.record),
     }
+
+
+def _claim(kind: Kind, path: Path) -> dict[str, Any] | None:
+    """What a certificate or a library claims, and what it only says; None for other kinds."""
+    if kind.name not in ("certificate", "library"):
+        return None
+    from sagemp_cli.checker.claim import claim_rows, said_rows
+    from sagemp_cli.checker.document import read_document
+    from sagemp_cli.errors import ArtifactError
+
+    try:
+        document = read_document(path)
+    except ArtifactError as e:
+        return {"claims": [["cannot be checked", str(e)]], "said": []}
+    return {"claims": [list(row) for row in claim_rows(document)], "said": [list(row) for row in said_rows(document)]}
 
 
 def _now(path: Path, sha256: str) -> str:
@@ -131,7 +163,7 @@ def _print(content: dict[str, Any]) -> None:
     if not console.is_terminal:
         console = Console(width=200)  # nobody resizes a pipe: one line per field
     facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    keys = ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "device", "sha256")
+    keys = ("file", "kind", "stage", "experiment", "seed", "created_utc", "seconds", "version", "sha256")
     for key in (*keys, "content"):
         value = content[key]
         facts.add_row(text(key, style="bold"), text(f"{value:.1f}" if isinstance(value, float) else str(value)))
@@ -141,6 +173,16 @@ def _print(content: dict[str, Any]) -> None:
     for line in content["verdicts"]:
         facts.add_row(text("verdict", style="bold"), text(line))
     console.print(facts)
+    claim = content["claim"] or {}
+    for title, rows in (
+        ("claimed, not checked here", claim.get("claims")),
+        ("said by the file, not proved", claim.get("said")),
+    ):
+        if rows:
+            lines = Table(box=None, show_header=False, padding=(0, 2, 0, 0), title=title, title_justify="left")
+            for label, said in rows:
+                lines.add_row(text(label, style="bold"), text(said))
+            console.print(lines)
     table = Table(box=None, padding=(0, 2, 0, 0))
     for column in ("name", "holds", "dims", "units", "doc"):
         table.add_column(column, overflow="fold")

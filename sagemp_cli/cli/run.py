@@ -74,6 +74,7 @@ def run(
             _make(context, wanted[proved:], dry_run=dry_run)
             return
         certificate = verdict.read_certificate(context.output_path("verify"))
+        again = verdict.rechecked(certificate)  # it may have been there already, and been changed since
         code = verdict.exit_code(certificate)
         try:
             if code != EXIT_FALSIFIED:
@@ -81,7 +82,7 @@ def run(
             elif wanted[proved:]:
                 typer.echo(f"{', '.join(own[proved:])}: not made, the claim is refuted")
         finally:
-            typer.echo(printable("\n".join(verdict.as_lines(certificate))))
+            typer.echo(printable("\n".join([f"verify: {again}", *verdict.as_lines(certificate)])))
     raise typer.Exit(code)
 
 

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sagemp_cli.errors import ANSWER_CODES, ArtifactError
+from sagemp_cli.errors import ANSWER_CODES, ArtifactError, UsageError
 
 if TYPE_CHECKING:
     from sagemp_cli.storage import Artifact, Certificate
@@ -27,6 +27,25 @@ def read_certificate(path: Path) -> Artifact[Certificate]:
             f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(ANSWER_CODES)}"
         )
     return artifact
+
+
+def rechecked(certificate: Artifact[Certificate]) -> str:
+    """That a file's verdict still fits its own tubes, scene and counterexamples, in words; or that nobody looked.
+
+    Raises:
+        ArtifactError: it does not fit.
+    """
+    try:
+        from sagemp_cli.checker.check import recheck
+    except UsageError as e:
+        return f"its verdict was not checked again ({e})"
+    wrong = recheck(certificate.path)
+    if wrong:
+        raise ArtifactError(
+            f"{certificate.path}: says {certificate.record.verdict}, but {wrong}; "
+            f"it was changed or damaged, remake it with 'sagemp verify --overwrite'"
+        )
+    return "tubes, scene and goal were checked again; 'sagemp check' proves the reach sets as well"
 
 
 def exit_code(certificate: Artifact[Certificate]) -> int:
@@ -173,9 +192,9 @@ def _learned(certificate: Artifact[Certificate]) -> dict[str, Any] | None:
     """Of a learned robot what is proved of its analytical model; None for a robot of formulas."""
     from sagemp_cli.config.binding import build
 
-    if certificate.record.dynamics is None:
-        return None
     robot: Any = build(certificate.header.config["dynamics"], "dynamics")
+    if robot.analytical is robot:
+        return None
     found: dict[str, Any] = {"model": type(robot.analytical).__name__, "true_model": None}
     true = certificate.record.true_model
     if true is None:

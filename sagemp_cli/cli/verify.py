@@ -44,10 +44,11 @@ def verify(
         return
     path, known = made
     certificate = verdict.read_certificate(path)
+    again = verdict.rechecked(certificate) if known else None
     if as_json:
-        typer.echo(json.dumps(verdict.as_json(certificate) | {"from_file": known}, indent=2))
+        typer.echo(json.dumps(verdict.as_json(certificate) | {"from_file": known, "rechecked": again}, indent=2))
     else:
         if known:
-            typer.echo(f"up to date, from the file of {certificate.header.created_utc}:")
+            typer.echo(f"up to date, from the file of {certificate.header.created_utc} ({again}):")
         typer.echo(printable("\n".join(verdict.as_lines(certificate))))
     raise typer.Exit(verdict.exit_code(certificate))

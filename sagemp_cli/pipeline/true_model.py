@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sagemp_cli.config.binding import Binding
 from sagemp_cli.loop.controller import Controller
+from sagemp_cli.pipeline.loop_record import deviation_record
 from sagemp_cli.pipeline.proof import Proof, counts_of
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.progress import Progress
@@ -45,7 +46,11 @@ class TrueModelProof:
         """Tubes and verdicts of references ``(R, K+1, n)``, and how much was folded."""
         found = self.proof.verify(references, tracker, progress=progress)
         plain, deviation = split(found, self.proof.problem.dynamics.control_dim)
-        return TrueModel(tubes=tubes_record(plain), deviation=deviation.numpy())
+        return TrueModel(
+            program=deviation_record(self.proof.problem, tracker),
+            tubes=tubes_record(plain),
+            deviation=deviation.numpy(),
+        )
 
 
 def _options(*, partitions: Any = None) -> None:

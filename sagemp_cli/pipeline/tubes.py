@@ -37,14 +37,13 @@ def tubes_record(v: Verification) -> Tubes:
         seconds=v.seconds.numpy(),
         propagator=v.propagator,
         rigorous=v.rigorous,
-        relaxations=None if v.recording is None else _relaxations(v.recording),
+        relaxations=None if v.recording is None else relaxations_record(v.recording),
     )
 
 
-def _relaxations(recording: Recording) -> Relaxations:
+def relaxations_record(recording: Recording) -> Relaxations:
+    """What a proof recorded, as stored."""
     return Relaxations(
-        operations=recording.operations,
-        widths=np.array(recording.widths, dtype=np.int64),
         slope=recording.slope.numpy(),
         offset=recording.offset.numpy(),
         radius=recording.radius.numpy(),
@@ -52,23 +51,15 @@ def _relaxations(recording: Recording) -> Relaxations:
     )
 
 
-def _recording(record: Relaxations) -> Recording:
-    return Recording(
-        record.operations,
-        tuple(record.widths.tolist()),
-        torch.from_numpy(record.slope),
-        torch.from_numpy(record.offset),
-        torch.from_numpy(record.radius),
-        None if record.kept is None else torch.from_numpy(record.kept),
-    )
-
-
 def verification_of(record: Tubes, where: str) -> Verification:
-    """A stored record as a verification; ``where`` names the file in messages.
+    """A stored record as a verification, without what it can be done again from; ``where`` names the file in messages.
 
     Raises:
-        ArtifactError: the cells are not sorted by reference, a reference has none, or a verdict is unknown.
+        ArtifactError: there are no references, the cells are not sorted by reference, a reference has none, or a
+            verdict is unknown.
     """
+    if record.references is None:
+        raise ArtifactError(f"{where}: /data/tubes holds no references")
     count, owner = len(record.references), record.cell_reference
     if count == 0 or (np.diff(owner) < 0).any() or not np.array_equal(np.unique(owner), np.arange(count)):
         raise ArtifactError(
@@ -97,5 +88,5 @@ def verification_of(record: Tubes, where: str) -> Verification:
         seconds=torch.from_numpy(record.seconds),
         propagator=record.propagator,
         rigorous=bool(record.rigorous),
-        recording=None if record.relaxations is None else _recording(record.relaxations),
+        recording=None,
     )

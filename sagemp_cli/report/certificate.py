@@ -176,7 +176,7 @@ def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -
 
 def _about_model(record: Certificate, dynamics: Dynamics) -> str:
     """Of a learned robot, what is proved of the model that it was learned from; nothing of others."""
-    if record.dynamics is None:
+    if dynamics.analytical is dynamics:
         return ""
     model = type(dynamics.analytical).__name__
     said = f"robot: a network learned from {model}"

@@ -13,6 +13,7 @@ from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.library import REASONS, build_library
 from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.pipeline.models import planner_from, tracker_from
 from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.pipeline.proof import Proof
@@ -80,15 +81,13 @@ def run(context: StageContext) -> Path:
     )
     record = Library(
         tubes=tubes_record(made.certified),
-        tracker=tracker_file.record.weights,
-        tracker_arguments=tracker_file.record.arguments,
+        loop=loop_record(problem, tracker),
         rejected_references=made.rejected.numpy(),
         rejected_reason=made.reasons,
         reason_names=REASONS,
         reason_counts=np.array(made.counts, dtype=np.int64),
         sampled=made.sampled,
         wanted=section.size,
-        dynamics=robot_files[0].record.weights if robot_files else None,
     )
     return context.write("build-library", record, (planner_file, tracker_file, *robot_files))
 

@@ -10,6 +10,7 @@ from typing import Any
 from sagemp_cli.config.binding import Binding
 from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.pipeline.context import StageContext
+from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.pipeline.models import planner_from, tracker_from
 from sagemp_cli.pipeline.partial import PartialResults
 from sagemp_cli.pipeline.problem import trained_problem
@@ -100,14 +101,12 @@ def run(context: StageContext) -> Path:
         )
     record = Certificate(
         tubes=tubes_record(refutation.verification),
-        tracker=tracker_file.record.weights,
-        tracker_arguments=tracker_file.record.arguments,
+        loop=loop_record(problem, tracker),
         counterexamples=tuple(
             _counterexample(r, found, decided(found, problem.dynamics)) for r, found in refutation.counterexamples
         ),
         falsifier_rollouts=refutation.rollouts,
         verdict=str(answer_of(refutation.verification.verdicts)),
-        dynamics=robot_files[0].record.weights if robot_files else None,
         true_model=folded.verify(references, tracker, context.progress) if folded and verification.safe else None,
         samples=None if given else sample_share(context, planner, tracker, proof, wanted=section.samples),
     )

@@ -71,7 +71,6 @@ class Header:
         seed: root seed.
         parents: files read.
         seconds: wall-clock seconds of the stage.
-        device: torch device used.
         created_utc, version, packages: filled when left empty.
     """
 
@@ -81,7 +80,6 @@ class Header:
     seed: int = 0
     parents: tuple[Parent, ...] = ()
     seconds: float = 0.0
-    device: str = "cpu"
     created_utc: str = ""
     version: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
@@ -181,7 +179,6 @@ def _write_header(file: h5py.File, kind: Kind, header: Header) -> None:
         "experiment": header.experiment,
         "seed": header.seed,
         "seconds": float(header.seconds),
-        "device": header.device,
         "created_utc": header.created_utc or now,
         "version": header.version or __version__,
         "packages": json.dumps(packages, sort_keys=True),
@@ -211,6 +208,8 @@ def _read_header(file: Group, path: Path) -> tuple[Kind, Header]:
             f"{path}: format {version} of '{kind.name}' is newer than this sagemp reads"
             f" (up to {kind.version}); update sagemp"
         )
+    if version < kind.oldest:
+        raise ArtifactError(f"{path}: format {version} of '{kind.name}' is an old one; make it again: {kind.command}")
     if "data" not in file:
         raise ArtifactError(f"{path}: group /data is missing")
     config = plain_yaml(_text(file["config"][()]))
@@ -227,7 +226,6 @@ def _read_header(file: Group, path: Path) -> tuple[Kind, Header]:
         seed=int(a["seed"]),
         parents=parents,
         seconds=float(a["seconds"]),
-        device=_text(a["device"]),
         created_utc=_text(a["created_utc"]),
         version=_text(a["version"]),
         packages={key: _text(value) for key, value in plain_mapping(a["packages"], "packages").items()},

@@ -102,14 +102,32 @@ class ProgramRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LoopRecord:
+    """The closed loop that a claim is about (see ``docs/certificates.md``)."""
+
+    programs: tuple[ProgramRecord, ...] = group(ProgramRecord, "the step, one program or several", many=True)
+    step_program: np.ndarray = array("K", "which of the programs each step is", dtype="int64")
+    lookahead: int = scalar("numbers of a step: the next so many states of the reference; 0: none")
+    state_names: tuple[str, ...] = texts("n", "names of the states")
+    state_units: tuple[str, ...] = texts("n", "their units")
+    control_names: tuple[str, ...] = texts("m", "names of the controls")
+    control_units: tuple[str, ...] = texts("m", "their units")
+    position: np.ndarray = array("p", "states that are the position in the scene", dtype="int64")
+    dt: float | None = scalar("time between two samples; said, not proved", units="s", optional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Relaxations:
     """The relaxations of a proof, from which it can be done again (see ``docs/certificates.md``)."""
 
-    operations: tuple[str, ...] = texts("operations", "nonlinear operations of a step, in the order of evaluation")
-    widths: np.ndarray = array("operations", "entries of each operation", dtype="int64")
     slope: np.ndarray = array("cells K entries", "slope of each line (scale of a product)", finite=False)
     offset: np.ndarray = array("cells K entries", "offset of each line", finite=False)
     radius: np.ndarray = array("cells K entries", "greatest distance of the function from the line", finite=False)
+    direction: np.ndarray | None = array(
+        "cells K angles sides",
+        "of each 'atan2' among them, the direction that its line is across: cosine and sine",
+        optional=True,
+    )
     kept: np.ndarray | None = array(
         "cells K bytes", "which generators were kept after each step, one bit each", dtype="uint8", optional=True
     )
@@ -119,7 +137,9 @@ class Relaxations:
 class Tubes:
     """References, their tubes and the verdicts (the body of ``verify``'s certificate and of a library)."""
 
-    references: np.ndarray = array("count K+1 n", "references from the planner, fixed in the proof")
+    references: np.ndarray | None = array(
+        "count K+1 n", "references from the planner, fixed in the proof; a loop may have none", optional=True
+    )
     start_lower: np.ndarray = array("count n", "lower corner of X_I")
     start_upper: np.ndarray = array("count n", "upper corner of X_I")
     disturbance_lower: np.ndarray = array("d", "lower corner of W")
@@ -145,15 +165,6 @@ class Tubes:
     propagator: str = scalar("propagator that made the tubes")
     rigorous: bool = scalar("whether rounding is included in the tubes")
     relaxations: Relaxations | None = group(Relaxations, "what the proof can be done again from", optional=True)
-    cell_begin: np.ndarray | None = array(
-        "cells", "step at which each cell's set begins (0: part of X_I)", dtype="int64", optional=True
-    )
-    cell_end: np.ndarray | None = array(
-        "cells", "step at which it goes over into its heir (K: never)", dtype="int64", optional=True
-    )
-    cell_heir: np.ndarray | None = array(
-        "cells", "index of the cell that begins there and encloses it (-1: none)", dtype="int64", optional=True
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,13 +177,14 @@ class Counterexample:
     constraint: str = scalar("obstacle, 'workspace' or goal dimension")
     depth: float = scalar("depth of the violation (> 0)")
     states: np.ndarray = array("K+1 n", "replayed states")
-    disturbances: np.ndarray = array("K n", "disturbances")
+    disturbances: np.ndarray = array("K d", "disturbances")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrueModel:
     """What is proved of the analytical model that a learned one stands for (see ``docs/certificates.md``)."""
 
+    program: ProgramRecord = group(ProgramRecord, "its step, by way of the learned one")
     tubes: Tubes = group(Tubes, "references, cells, tubes and verdicts of the analytical model")
     deviation: np.ndarray = array(
         "count K n", "bound of the learned model's deviation at each step, which w is enlarged by", finite=False
@@ -193,12 +205,10 @@ class Certificate:
     """What ``verify`` proved, with everything that the proof speaks about."""
 
     tubes: Tubes = group(Tubes, "references, cells, tubes and verdicts")
-    tracker: dict[str, np.ndarray] = weights("tracker weights, exact")
-    tracker_arguments: str = scalar("tracker constructor arguments, as JSON")
+    loop: LoopRecord = group(LoopRecord, "the closed loop that this is about")
     counterexamples: tuple[Counterexample, ...] = group(Counterexample, "replayed counterexamples", many=True)
     falsifier_rollouts: int = scalar("rollouts that the falsifier tried")
     verdict: str = scalar("VERIFIED, FALSIFIED or UNKNOWN for all references together")
-    dynamics: dict[str, np.ndarray] | None = weights("of a learned robot: its weights, exact", optional=True)
     true_model: TrueModel | None = group(
         TrueModel, "of a learned robot: what holds of its analytical model", optional=True
     )
@@ -212,15 +222,13 @@ class Library:
     """Certified references (Algorithm 2, made by ``build-library``)."""
 
     tubes: Tubes = group(Tubes, "the certified references only")
-    tracker: dict[str, np.ndarray] = weights("tracker weights, exact")
-    tracker_arguments: str = scalar("tracker constructor arguments, as JSON")
+    loop: LoopRecord = group(LoopRecord, "the closed loop that this is about")
     rejected_references: np.ndarray = array("rejected K+1 n", "references that were not certified", finite=False)
     rejected_reason: tuple[str, ...] = texts("rejected", "why each was rejected")
     reason_names: tuple[str, ...] = texts("reasons", "reasons of rejection")
     reason_counts: np.ndarray = array("reasons", "how often each occurred", dtype="int64")
     sampled: int = scalar("references sampled altogether")
     wanted: int = scalar("certified references asked for, C")
-    dynamics: dict[str, np.ndarray] | None = weights("of a learned robot: its weights, exact", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,11 +286,19 @@ class SafetyRates:
 
 @dataclass(frozen=True)
 class Kind:
-    """Name and format version of a record class."""
+    """Name and format versions of a record class.
+
+    Attributes:
+        version: the newest one, which is written.
+        oldest: the oldest one that is read.
+        command: of an old file, what makes it again.
+    """
 
     name: str
     version: int
     record: type
+    oldest: int = 1
+    command: str = ""
 
 
 KINDS = (
@@ -290,8 +306,8 @@ KINDS = (
     Kind("dynamics", 1, DynamicsModel),
     Kind("planner", 1, PlannerModel),
     Kind("tracker", 1, TrackerModel),
-    Kind("certificate", 1, Certificate),
-    Kind("library", 1, Library),
+    Kind("certificate", 2, Certificate, oldest=2, command="sagemp verify --overwrite"),
+    Kind("library", 2, Library, oldest=2, command="sagemp build-library --overwrite"),
     Kind("rollouts", 1, Rollouts),
     Kind("safety", 1, SafetyRates),
 )

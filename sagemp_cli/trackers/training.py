@@ -1,8 +1,6 @@
 """Training the tracker: back-propagation through closed-loop rollouts on the planner's own references.
 
-``tracker_training=plain`` minimises the paper's loss, on rollouts that are shorter than the horizon, begin anywhere on
-the reference and are disturbed by constant extremes half of the time; the paper says of its rollouts only that they
-have N steps. ``tracker_training=certified`` adds the width of a
+``tracker_training=plain`` minimises exactly the paper's loss. ``tracker_training=certified`` adds the width of a
 differentiable reach tube (forward affine arithmetic through the same loop), with the radius of the sets annealed from
 small to full: the tracker learns to be verifiable, not only to track.
 """

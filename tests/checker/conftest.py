@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import torch
 
 from sagemp_cli.config.binding import target_class
 from sagemp_cli.loop.tracker import Tracker
-from sagemp_cli.pipeline.models import weights_of
+from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
@@ -88,8 +87,7 @@ class Case:
         """The certificate as a file."""
         values: dict[str, Any] = {
             "tubes": self.tubes,
-            "tracker": weights_of(self.tracker),
-            "tracker_arguments": json.dumps(self.arguments),
+            "loop": loop_record(self.problem, self.tracker),
             "counterexamples": (),
             "falsifier_rollouts": 0,
             "verdict": "VERIFIED" if set(self.tubes.verdict) == {"SAFE"} else "UNKNOWN",
@@ -156,6 +154,21 @@ def mutant(source: Path, path: Path, change: Callable[[h5py.File], None], *, reh
         if rehash:
             file.attrs[HASH_ATTRIBUTE] = content_hash(file)
     return path
+
+
+STEP = "data/loop/programs/000000"
+"""The program of a certificate."""
+
+
+def slots_of(file: h5py.File, kind: str, program: str = STEP) -> list[int]:
+    """The slots of a kind."""
+    return [i for i, k in enumerate(file[f"{program}/kinds"].asstr()[()]) if k == kind]
+
+
+def constants_of(file: h5py.File, slot: int, program: str = STEP) -> slice:
+    """Where the constants of a slot are in the program's numbers."""
+    begin = file[f"{program}/number_begin"][()]
+    return slice(int(begin[slot]), int(begin[slot + 1]))
 
 
 @pytest.fixture

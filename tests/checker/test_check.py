@@ -1,5 +1,4 @@
 import dataclasses
-import json
 import shutil
 
 import h5py
@@ -14,7 +13,6 @@ from sagemp_cli.cli.main import app
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.sets import Box
 from sagemp_cli.storage import Counterexample
 from sagemp_cli.storage.content import content_hash
 
@@ -141,7 +139,7 @@ def test_the_hash_changes_with_anything_in_the_file(certificate, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["config", "data/tubes/tube_lower", "data/tubes/relaxations/slope", "data/tracker/layers.0.bias"]
+    "name", ["config", "data/tubes/tube_lower", "data/tubes/relaxations/slope", "data/loop/programs/000000/numbers"]
 )
 def test_the_hash_alone_rejects_a_change(name, certificate, mutate, tmp_path):
     def change(file):
@@ -181,14 +179,13 @@ def test_a_file_that_is_no_certificate_of_this_format_is_refused(change, message
     assert result.exit_code == 2 and message in result.stderr
 
 
-def test_a_config_that_names_a_foreign_class_is_refused(certificate, mutate, tmp_path):
+def test_a_class_that_the_config_names_is_not_looked_for(certificate, mutate, tmp_path):
     def change(file):
         text = file["config"].asstr()[()].replace("sagemp_cli.dynamics.unicycle.Unicycle", "os.system")
         del file["config"]
         file.create_dataset("config", data=text, dtype=h5py.string_dtype())
 
-    with pytest.raises(ArtifactError, match="/config does not describe a problem"):
-        check(mutate(certificate, tmp_path / "mutant.h5", change))
+    assert check(mutate(certificate, tmp_path / "mutant.h5", change)).answer == "VERIFIED"
 
 
 @pytest.mark.parametrize(
@@ -199,8 +196,9 @@ def test_a_config_that_names_a_foreign_class_is_refused(certificate, mutate, tmp
         (lambda c: c["scene"]["obstacles"][0].update(kind="torus"), "obstacle 'disc' is of unknown kind 'torus'"),
         (lambda c: c.pop("start"), "'start'"),
         (lambda c: c["start"].update(radius=["a", 0, 0, 0]), "a number is needed, found something of type str"),
-        (lambda c: c["dynamics"].update(dt=0), "Unicycle: dt must be a positive number of seconds, found 0"),
-        (lambda c: c["dynamics"].update(wheels=4), "dynamics.wheels: Unicycle has no such option"),
+        (lambda c: c.update(horizon=9), "the horizon is 9, the tubes have 8 steps"),
+        (lambda c: c["start"].update(center=[0.0] * 5), "the start has 5 and 4 numbers, 4 are needed"),
+        (lambda c: c["scene"]["goal"].update(lower=[0.3] * 3), "zip() argument"),
     ],
 )
 def test_a_config_that_is_not_understood_is_refused(change, message, certificate, mutate, tmp_path):
@@ -213,15 +211,6 @@ def test_a_config_that_is_not_understood_is_refused(change, message, certificate
     with pytest.raises(ArtifactError) as error:
         check(mutate(certificate, tmp_path / "mutant.h5", edit))
     assert message in str(error.value)
-
-
-def test_a_tracker_that_is_not_understood_is_refused(certificate, mutate, tmp_path):
-    def edit(file):
-        arguments = json.loads(file["data"].attrs["tracker_arguments"]) | {"activation": "tanh"}
-        file["data"].attrs["tracker_arguments"] = json.dumps(arguments)
-
-    with pytest.raises(ArtifactError, match="tracker argument 'activation' is not understood"):
-        check(mutate(certificate, tmp_path / "mutant.h5", edit))
 
 
 def test_a_file_cut_off_at_any_place_is_refused(certificate, tmp_path):
@@ -244,114 +233,3 @@ def test_the_command_says_what_was_proved(certificate, tmp_path):
     assert "reference 0: proved, keeps 0.467 m from disc" in result.output
     as_json = run(tmp_path / "certificate.h5", "--json")
     assert as_json.exit_code == 0 and '"answer": "VERIFIED"' in as_json.output
-
-
-@dataclasses.dataclass(frozen=True)
-class Later:
-    """A closed loop from a later step on."""
-
-    loop: ClosedLoop
-    first: int
-
-    @property
-    def horizon(self):
-        return self.loop.horizon - self.first
-
-    @property
-    def state_dim(self):
-        return self.loop.state_dim
-
-    def step(self, k, x, w):
-        return self.loop.step(k + self.first, x, w)
-
-
-def merged(case, path, *, at=4, shrink=0.0, gap=0.0):
-    """The two cells of a case go on from step ``at`` as one box around both."""
-    record, tracker, dynamics, w = case.tubes, case.tracker, case.problem.dynamics, case.problem.disturbance
-    sides = record.tube_lower[:, at].min(0) + shrink, record.tube_upper[:, at].max(0) - shrink
-    hull = Box(*map(torch.from_numpy, sides))
-    loop = ClosedLoop(dynamics, tracker, torch.from_numpy(record.references[0]))
-    with torch.no_grad():
-        run = Affine().run(Later(loop, at), hull, w)
-    late = record.relaxations.slope.shape[1] - at
-
-    def joined(values, new):
-        return np.concatenate([values, new[None].astype(values.dtype)])
-
-    def with_heir(values, late_rows):
-        out = joined(values, np.zeros_like(values[0]))
-        out[2, -late:] = late_rows
-        return out
-
-    recording = run.recording()
-    size = max(record.relaxations.kept.shape[-1], recording.kept.shape[-1])
-    before, after = (
-        np.pad(kept, [*[(0, 0)] * (kept.ndim - 1), (0, size - kept.shape[-1])])
-        for kept in (record.relaxations.kept, recording.kept.numpy())
-    )
-    relaxations = dataclasses.replace(
-        record.relaxations,
-        **{n: with_heir(getattr(record.relaxations, n), getattr(recording, n).numpy()) for n in BANDS},
-        kept=with_heir(before, after),
-    )
-    lower, upper = (joined(v, v[0]) for v in (record.tube_lower, record.tube_upper))
-    lower[2, at:], upper[2, at:] = run.tube.lower.numpy(), run.tube.upper.numpy()
-    lower[2, :at], upper[2, :at] = lower[:2, :at].min(0), upper[:2, :at].max(0)
-    for c in range(2):
-        lower[c, at:] = np.minimum(lower[c, at:], lower[2, at:] + gap)
-        upper[c, at:] = np.maximum(upper[c, at:], upper[2, at:])
-    controls = record.control_lower - 1.0, record.control_upper + 1.0
-    tubes = dataclasses.replace(
-        record,
-        cell_reference=np.zeros(3, dtype=np.int64),
-        cell_lower=joined(record.cell_lower, hull.lower.numpy()),
-        cell_upper=joined(record.cell_upper, hull.upper.numpy()),
-        tube_lower=lower,
-        tube_upper=upper,
-        control_lower=controls[0],
-        control_upper=controls[1],
-        clearance=record.clearance - 0.1,
-        goal_margin=record.goal_margin - 0.1,
-        relaxations=relaxations,
-        cell_begin=np.array([0, 0, at]),
-        cell_end=np.array([at, at, 8]),
-        cell_heir=np.array([2, 2, -1]),
-    )
-    return case.write(path, tubes=tubes)
-
-
-BANDS = ("slope", "offset", "radius")
-
-
-def test_cells_may_go_over_into_one_that_encloses_them(case, tmp_path):
-    report = check(merged(case, tmp_path / "certificate.h5"))
-    assert report.answer == "VERIFIED", report.findings
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"cell_heir": [2, 1, -1]}, "cell 1 ends at step 4, but its heir 1 does not begin there"),
-        ({"cell_heir": [-1, 2, -1]}, "cell 0 does not last from one step to a later one, or its heir is missing"),
-        ({"cell_begin": [0, 0, 5]}, "cell 0 ends at step 4, but its heir 2 does not begin there"),
-        ({"cell_begin": [0, 4, 4]}, "does not last"),
-        ({"cell_begin": [0, 1, 4]}, "its cells do not cover X_I"),
-        ({"cell_end": [4, 4, 7]}, "cell 2 does not last"),
-    ],
-)
-def test_a_record_of_merging_that_makes_no_sense_proves_nothing(change, why, case, mutate, tmp_path):
-    path = merged(case, tmp_path / "certificate.h5")
-
-    def edit(file):
-        for name, values in change.items():
-            file["data/tubes"][name][...] = values
-
-    report = check(mutate(path, tmp_path / "mutant.h5", edit))
-    assert report.answer == "UNKNOWN" and why in report.findings[0].reason
-
-
-def test_a_merged_set_must_enclose_what_it_replaces(case, tmp_path):
-    small = check(merged(case, tmp_path / "small.h5", shrink=1e-6))
-    assert small.answer == "UNKNOWN" and "state of the merged set 0 is only proved to lie" in small.findings[0].reason
-    gap = check(merged(case, tmp_path / "gap.h5", gap=1e-6))
-    assert gap.answer == "UNKNOWN" and "does not contain that of its heir 2" in gap.findings[0].reason

@@ -13,7 +13,7 @@ NAMED = {
     **FUNCTIONS,
     "leaky_relu": leaky_relu(0.1),
     "clamp": clamp(-0.5, 1.5),
-    "clamp from below": clamp(0.25, None),
+    "clamp from below": clamp(0.25, math.inf),
     "elu": elu(1.0),
     "softplus": softplus(2.0, 20.0),
     "square": integer_power(2),
@@ -75,3 +75,11 @@ def test_nothing_follows_from_numbers_that_are_not_finite(bad):
     for arguments in ((bad, arb(0), arb(1)), (arb(0), bad, arb(1)), (arb(0), arb(0), bad)):
         with pytest.raises(Unproved, match="not finite"):
             FUNCTIONS["sin"].excess(*arguments)
+
+
+@pytest.mark.parametrize("slope", [-1.0, 0.0, 0.4, 3.0])
+def test_a_root_is_bounded_from_0_on(slope):
+    least, most = FUNCTIONS["sqrt"].excess(arb(slope), arb(0), arb(2))
+    x = np.linspace(0, 2, 100_001)
+    values = np.sqrt(x) - slope * x
+    assert float(least) <= values.min() + 1e-12 and values.max() <= float(most) <= values.max() + 1e-3

@@ -3,14 +3,13 @@
 import copy
 import dataclasses
 
-import h5py
 import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.pipeline.models import weights_of
+from sagemp_cli.pipeline.loop_record import deviation_record
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import TrueModel
@@ -18,7 +17,15 @@ from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.deviation import Folded, split
 from sagemp_cli.verification.verification import verify_references
 
-FIRST = "data/dynamics/layers.0.weight"
+from .conftest import STEP, constants_of, slots_of
+
+TRUE = "data/true_model/program"
+
+
+def layer(file, i, program=STEP):
+    """Where matrix and bias of a layer of the robot's network are in the numbers of a program."""
+    control = file[f"{program}/outputs"][1]
+    return constants_of(file, [s for s in slots_of(file, "linear", program) if s > control][i], program)
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +39,13 @@ def write(case):
             for propagator in (Affine(), Folded(Affine()))
         )
         true, deviation = split(true, 2)
-        learned = dataclasses.replace(case, config=case.config | {"dynamics": section}, tubes=tubes_record(own))
-        record = TrueModel(tubes=tubes_record(true), deviation=deviation.numpy())
-        return learned.write(path, dynamics=weights_of(robot), true_model=record)
+        learned = dataclasses.replace(
+            case, config=case.config | {"dynamics": section}, problem=problem, tubes=tubes_record(own)
+        )
+        record = TrueModel(
+            program=deviation_record(problem, case.tracker), tubes=tubes_record(true), deviation=deviation.numpy()
+        )
+        return learned.write(path, true_model=record)
 
     return write
 
@@ -52,23 +63,49 @@ def test_both_the_network_and_its_model_are_proved(learned):
     assert report.true_model[0].clearance["disc"] < report.findings[0].clearance["disc"]
 
 
-def test_a_changed_weight_is_refused_by_the_hash(learned, mutate, tmp_path):
-    def change(file):
-        file[FIRST][0, 2] = 0.1000001
-
-    with pytest.raises(ArtifactError, match="the content was changed after it was written"):
-        check(mutate(learned, tmp_path / "mutant.h5", change, rehash=False))
-
-
-@pytest.mark.parametrize("place", [("0.weight", (1, 3), 0.12), ("1.weight", (0, 1), 0.4), ("2.bias", (1,), 0.3)])
+@pytest.mark.parametrize("place", [(0, 9, 0.12), (1, 1, 0.4), (2, 17, 0.3)])
 def test_a_network_with_other_weights_is_not_proved(learned, mutate, tmp_path, place):
-    name, index, value = place
+    number, entry, value = place
 
     def change(file):
-        file[f"data/dynamics/layers.{name}"][index] = value
+        for program in (STEP, TRUE):  # else the two are not of the same network, which is a reason of its own
+            file[f"{program}/numbers"][layer(file, number, program).start + entry] = value
 
     report = check(mutate(learned, tmp_path / "mutant.h5", change))
     assert report.answer == "UNKNOWN" and not report.findings[0].proved
+    assert report.problems == () or "step" in report.problems[0]
+
+
+def other_weight(file):
+    file[f"{TRUE}/numbers"][layer(file, 0, TRUE).start] += 1e-9
+
+
+def no_deviation(file):
+    file[f"{TRUE}/outputs"][2] = 0
+
+
+def not_folded(file):
+    slot = slots_of(file, "identity", TRUE)[0]
+    file[f"{TRUE}/kinds"][slot] = "neg"
+    place = file["data/true_model/tubes/relaxations"]
+    for name in ("slope", "offset", "radius"):
+        values = place[name][()][..., :-4]
+        del place[name]
+        place[name] = values
+
+
+def another_control(file):
+    control, sizes = file[f"{TRUE}/outputs"][1], file[f"{TRUE}/sizes"][()]
+    file[f"{TRUE}/outputs"][1] = next(i for i in range(control) if sizes[i] == sizes[control])
+
+
+@pytest.mark.parametrize("change", [other_weight, no_deviation, not_folded, another_control])
+def test_the_model_must_be_the_network_with_the_deviation_in_w(change, learned, mutate, tmp_path):
+    report = check(mutate(learned, tmp_path / "mutant.h5", change))
+    assert report.answer == "UNKNOWN"
+    assert report.problems[0] == (
+        "the analytical model: its step is not that of the network with the deviation added to w"
+    )
 
 
 def test_a_smaller_deviation_is_not_believed_and_the_whole_file_is_not_proved(learned, mutate, tmp_path):
@@ -85,7 +122,7 @@ def test_a_smaller_deviation_is_not_believed_and_the_whole_file_is_not_proved(le
 def test_a_narrower_fold_is_not_believed(learned, mutate, tmp_path):
     def change(file):
         group = file["data/true_model/tubes/relaxations"]
-        assert group["operations"].asstr()[-1] == "identity"
+        assert slots_of(file, "identity", TRUE)
         group["radius"][:, 4, -3] *= 0.5
 
     report = check(mutate(learned, tmp_path / "mutant.h5", change))
@@ -105,29 +142,16 @@ def test_the_networks_tube_does_not_pass_for_that_of_a_drifting_model(write, lea
     assert report.findings[0].proved and not report.true_model[0].proved and report.answer == "UNKNOWN"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda file: file.__delitem__("data/dynamics"), "/data/true_model needs a learned robot"),
-        (lambda file: file.__delitem__(FIRST), "dynamics: weight 'layers.0.weight' is missing"),
-        (lambda file: file[FIRST].__setitem__((0, 0), np.nan), "dynamics: weight 'layers.0.weight' must be finite"),
-        (
-            lambda file: file["data/dynamics"].create_dataset("more", data=[1.0]),
-            "dynamics: weight 'more' is not understood",
-        ),
-        (lambda file: file.__delitem__("data/true_model/deviation"), "not a certificate, or a damaged one"),
-    ],
-)
-def test_a_file_whose_weights_are_not_those_of_its_robot_is_refused(learned, mutate, tmp_path, change, message):
-    with pytest.raises(ArtifactError, match=message):
-        check(mutate(learned, tmp_path / "mutant.h5", change))
+def test_a_model_without_bounds_of_its_deviation_is_refused(learned, mutate, tmp_path):
+    with pytest.raises(ArtifactError, match="not a certificate, or a damaged one"):
+        check(mutate(learned, tmp_path / "mutant.h5", lambda file: file.__delitem__("data/true_model/deviation")))
 
 
-def test_weights_beside_a_robot_of_formulas_are_refused(case, mutate, certificate, tmp_path):
+def test_weights_beside_the_program_are_refused(mutate, certificate, tmp_path):
     def change(file):
         file["data"].create_group("dynamics").create_dataset("layers.0.weight", data=np.zeros((2, 2)))
 
-    with pytest.raises(ArtifactError, match="dynamics: weight 'layers.0.weight' is not understood"):
+    with pytest.raises(ArtifactError, match="/data holds 'dynamics', which no certificate does"):
         check(mutate(certificate, tmp_path / "mutant.h5", change))
 
 
@@ -144,5 +168,3 @@ def test_the_command_says_what_is_proved_of_which_model(learned):
     report = check(learned)
     assert "  the robot is a network learned from an analytical model; of that model itself:" in as_lines(report)
     assert as_data(report)["true_model"][0]["proved"] is True
-    with h5py.File(learned) as file:
-        assert set(file["data/dynamics"]) == {f"layers.{i}.{name}" for i in range(3) for name in ("weight", "bias")}

@@ -6,7 +6,6 @@ true, simulated rollouts decide first: only a change that they contradict counts
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 
@@ -20,8 +19,11 @@ from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
+
+from .conftest import STEP, constants_of, slots_of
 
 WANTED = {
     "tube": 50, "relaxation": 80, "product": 30, "weight": 50, "reference": 25, "cell": 30, "start": 25,
@@ -156,10 +158,10 @@ def weight(rng, truth) -> Iterator[Change]:
         tracker = Tracker(**truth.case.arguments)
         tracker.load_state_dict(state)
         if truth.escape(tracker=tracker):
-            data = state[name].numpy()
+            numbers = loop_record(truth.case.problem, tracker).programs[0].numbers
 
-            def change(file, name=name, data=data):
-                file[f"data/tracker/{name}"][()] = data
+            def change(file, numbers=numbers):
+                file[f"{STEP}/numbers"][()] = numbers
 
             yield change
 
@@ -269,21 +271,33 @@ def control(rng, truth) -> Iterator[Change]:
 
 
 def model(rng, truth) -> Iterator[Change]:
-    def arguments(**new):
+    def constant(kind, values):
         def change(file):
-            stored = json.loads(file["data"].attrs["tracker_arguments"])
-            file["data"].attrs["tracker_arguments"] = json.dumps(stored | new)
+            slot = slots_of(file, kind)[-1 if kind == "constant" else 0]  # the last one is dt
+            file[f"{STEP}/numbers"][constants_of(file, slot)] = values
 
         return change
+
+    def read_as_state(file):
+        """w is no rate: it is added after the product with dt."""
+        group, last = file[STEP], len(file[f"{STEP}/kinds"]) - 1
+        operands, begin = group["operands"][()], group["operand_begin"][()]
+        with_w = next(i for i in slots_of(file, "add") if 1 in operands[begin[i] : begin[i + 1]])
+        rate = operands[begin[with_w]]
+        operands[operands == with_w] = rate
+        operands[begin[with_w] : begin[with_w + 1]] = [rate, rate]
+        assert operands[begin[last]] == 0
+        operands[begin[last]] = 1
+        group["operands"][()] = operands
 
     while True:
         dt = float(rng.choice([0.05, 0.09, 0.11, 0.2]))
         yield [
-            change_config(lambda c: c["dynamics"].update(dt=dt)),
-            change_config(lambda c: c["dynamics"].update(disturbance="state")),
+            constant("constant", dt),
+            read_as_state,
             change_config(lambda c: c.update(horizon=int(rng.integers(9, 20)))),
-            arguments(negative_slope=float(rng.uniform(0.2, 0.9))),
-            arguments(lookahead=int(rng.choice([1, 2, 4, 5]))),
+            constant("leaky_relu", float(rng.uniform(0.2, 0.9))),
+            lambda file: file["data/loop"].attrs.__setitem__("lookahead", int(rng.choice([1, 2, 4, 5]))),
         ][rng.integers(5)]
 
 
@@ -300,12 +314,11 @@ def structure(rng, truth) -> Iterator[Change]:
         file["data/tubes"][name][()] = data
 
     def rename(file, name):
-        operations = file["data/tubes/relaxations/operations"]
-        operations[int(rng.integers(len(operations)))] = name
+        slots = slots_of(file, "leaky_relu") + slots_of(file, "cos") + slots_of(file, "sin")
+        file[f"{STEP}/kinds"][int(rng.choice(slots))] = name
 
-    def move_width(file):
-        widths = file["data/tubes/relaxations/widths"]
-        widths[0], widths[1] = 5, 3
+    def move_size(file):
+        file[f"{STEP}/sizes"][int(rng.integers(len(file[f"{STEP}/sizes"])))] += int(rng.choice([-1, 1]))
 
     def drop(file, name):
         del file["data/tubes"][name]
@@ -322,7 +335,7 @@ def structure(rng, truth) -> Iterator[Change]:
             lambda f: nothing_finite(f, name, value),
             lambda f: nothing_finite(f, name, value),
             lambda f: rename(f, str(rng.choice(["relu", "tanh", "abs", "exp", "", "square"]))),
-            move_width,
+            move_size,
             lambda f: drop(f, name),
             cut,
         ][rng.integers(6)]

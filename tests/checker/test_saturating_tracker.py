@@ -1,14 +1,14 @@
 """Certificates of trackers that cut their controls off."""
 
 import copy
-import json
 
+import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.checker.check import check
 
-from .conftest import make_case
+from .conftest import STEP, constants_of, make_case, slots_of
 
 
 @pytest.fixture(scope="module")
@@ -40,34 +40,39 @@ def test_controls_closer_than_the_limit_are_refused(saturated, mutate, tmp_path)
     assert report.answer == "UNKNOWN" and "control" in report.findings[0].reason
 
 
-@pytest.mark.parametrize("claimed", [False, None, 1, "true"])
-def test_a_file_that_says_otherwise_of_its_tracker_is_refused(saturated, claimed, mutate, tmp_path):
+def limits(file):
+    """Where the limits of the clamp are in the numbers."""
+    (slot,) = slots_of(file, "clamp")
+    return constants_of(file, slot)
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(0.9, 0.0), (1.01, 0.0), (1.0, 0.01), (float("inf"), 0.0)])
+def test_another_limit_is_another_loop(factor, shift, saturated, mutate, tmp_path):
     def change(file):
-        arguments = json.loads(file["data"].attrs["tracker_arguments"])
-        arguments["saturate"] = claimed
-        if claimed is None:
-            del arguments["saturate"]
-        file["data"].attrs["tracker_arguments"] = json.dumps(arguments)
+        place = limits(file)
+        file[f"{STEP}/numbers"][place] = file[f"{STEP}/numbers"][place] * factor + shift
 
-    path = mutate(saturated[1], tmp_path / "mutant.h5", change)
-    if claimed is False or claimed is None:
-        assert check(path).answer == "UNKNOWN"
-    else:
-        with pytest.raises(Exception, match="tracker argument 'saturate' must be true or false"):
-            check(path)
-
-
-def test_a_tracker_that_does_not_saturate_is_not_taken_for_one_that_does(certificate, mutate, tmp_path):
-    def change(file):
-        arguments = json.loads(file["data"].attrs["tracker_arguments"]) | {"saturate": True}
-        file["data"].attrs["tracker_arguments"] = json.dumps(arguments)
-
-    report = check(mutate(certificate, tmp_path / "mutant.h5", change))
+    report = check(mutate(saturated[1], tmp_path / "mutant.h5", change))
     assert report.answer == "UNKNOWN" and "'clamp'" in report.findings[0].reason
+
+
+def test_a_step_that_cuts_nothing_off_is_not_proved_by_one_that_does(saturated, mutate, tmp_path):
+    def change(file):
+        (slot,), place = slots_of(file, "clamp"), limits(file)
+        file[f"{STEP}/kinds"][slot] = "identity"
+        numbers = np.delete(file[f"{STEP}/numbers"][()], np.r_[place])
+        del file[f"{STEP}/numbers"]
+        file[f"{STEP}/numbers"] = numbers
+        file[f"{STEP}/number_begin"][slot + 1 :] -= place.stop - place.start
+
+    report = check(mutate(saturated[1], tmp_path / "mutant.h5", change))
+    assert report.answer == "UNKNOWN" and "'identity'" in report.findings[0].reason
 
 
 def test_the_limit_itself_is_read_from_the_scales(saturated, mutate, tmp_path):
     def change(file):
-        file["data/tracker/control_scale"][...] *= 1.01
+        (slot,) = slots_of(file, "clamp")
+        scale = constants_of(file, next(s for s in slots_of(file, "constant") if s > slot))
+        file[f"{STEP}/numbers"][scale] *= 1.01
 
     assert check(mutate(saturated[1], tmp_path / "mutant.h5", change)).answer == "UNKNOWN"

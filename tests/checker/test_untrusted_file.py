@@ -1,6 +1,7 @@
 """Files that are made to mislead, to cost more than they are, or to end the checker with anything but an answer."""
 
 import dataclasses
+import time
 
 import h5py
 import numpy as np
@@ -12,6 +13,8 @@ from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.storage import Counterexample
+
+from .conftest import STEP, constants_of, slots_of
 
 HUGE = 10**400
 NOT_READ = "not a certificate, or a damaged one"
@@ -47,9 +50,9 @@ def rewrite(file, text):
         (lambda c: c["start"].update(angle=1.0), "the start says 'angle', which is not understood"),
         (lambda c: c["start"].update(radius=[HUGE] * 4), "too large"),
         (lambda c: c["disturbance"].update(lower=[-1.0] * 4), "the disturbance says 'lower'"),
-        (lambda c: c["dynamics"].update(dt=HUGE), "too large"),
-        (lambda c: c["dynamics"].update(dt=True), "dynamics.dt must be a positive number of seconds, found True"),
-        (lambda c: c["dynamics"].update(name="a" * 300), "too long"),
+        (lambda c: c.update(horizon=True), "the horizon is True"),
+        (lambda c: c.update(horizon=8.5), "the horizon is 8.5"),
+        (lambda c: c["start"].pop("radius"), "the start says 'center', which is not understood"),
     ],
 )
 def test_a_config_that_could_be_misunderstood_is_refused(edit, message, certificate, mutate, tmp_path):
@@ -82,31 +85,114 @@ def test_a_config_in_any_other_writing_is_refused(write, message, certificate, m
     assert message in str(error.value)
 
 
-def test_a_tracker_argument_that_is_there_twice_is_refused(certificate, mutate, tmp_path):
-    def change(file):
-        attributes = file["data"].attrs
-        attributes["tracker_arguments"] = '{"negative_slope": 0.9, ' + attributes["tracker_arguments"][1:]
-
-    with pytest.raises(ArtifactError, match="could be misread"):
-        check(mutate(certificate, tmp_path / "mutant.h5", change))
-
-
 def test_a_formula_that_divides_by_zero_proves_nothing(make, mutate, tmp_path):
     source = make("quadrotor", horizon=4).write(tmp_path / "source.h5")
-    path = mutate(source, tmp_path / "mutant.h5", edited(lambda c: c["dynamics"].update(inertia=[0.0, 0.1, 0.3])))
-    assert "division by zero" in check(path).findings[0].reason
 
-
-@pytest.mark.parametrize("name", ["error_scale", "control_offset", "layers.0.bias"])
-def test_weights_with_a_dimension_more_are_refused(name, certificate, mutate, tmp_path):
     def change(file):
-        group = file["data/tracker"]
-        values = group[name][()]
-        del group[name]
-        group[name] = values[:, None]
+        constants = [constants_of(file, s) for s in slots_of(file, "constant")]
+        inertia = next(c for c in constants if file[f"{STEP}/numbers"][c].tolist() == [0.5])
+        file[f"{STEP}/numbers"][inertia] = 0.0
 
-    with pytest.raises(ArtifactError, match="tracker weights do not fit each other"):
-        check(mutate(certificate, tmp_path / "mutant.h5", change))
+    report = check(mutate(source, tmp_path / "mutant.h5", change))
+    assert report.answer == "UNKNOWN" and report.findings[0].reason
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g.attrs.__setitem__("lookahead", 2), "its operands have 8 and 12 entries"),
+        (lambda g: g.attrs.__setitem__("lookahead", -1), "lookahead is -1"),
+        (lambda g: g.attrs.__setitem__("lookahead", 10**12), "lookahead is 10000"),
+        (lambda g: put(g, "position", np.array([0, 4])), "must be entries of 4 states"),
+        (lambda g: put(g, "position", np.array([1, 1])), "names a state twice"),
+        (lambda g: put(g, "position", np.array([0.0, 1.0])), "must be entries of 4 states"),
+        (lambda g: put(g, "position", np.array([0])), "the dimensions of 1 positions and 4 states"),
+        (lambda g: put(g, "step_program", np.zeros(7, np.int64)), "must be 8 numbers of its 1 programs"),
+        (lambda g: put(g, "step_program", np.ones(8, np.int64)), "must be 8 numbers of its 1 programs"),
+        (lambda g: put(g, "step_program", -np.ones(8, np.int64)), "must be 8 numbers of its 1 programs"),
+        (lambda g: put(g, "state_names", ["px", "py", "theta"]), "must name 4 states and 2 controls"),
+        (lambda g: put(g, "state_names", ["px", "px", "theta", "v"]), "has a name twice"),
+        (lambda g: put(g, "state_names", ["p" * 99, "py", "theta", "v"]), "in short words"),
+        (lambda g: put(g, "more", np.zeros(2)), "/data/loop holds 'more', which no certificate does"),
+        (lambda g: g.__delitem__("programs/000000"), "needs a program"),
+    ],
+)
+def test_a_loop_that_makes_no_sense_is_refused(change, message, certificate, mutate, tmp_path):
+    with pytest.raises(ArtifactError) as error:
+        check(mutate(certificate, tmp_path / "mutant.h5", lambda file: change(file["data/loop"])))
+    assert message in str(error.value)
+
+
+def put(group, name, values):
+    if name in group:
+        del group[name]
+    group.create_dataset(name, data=values, dtype=h5py.string_dtype() if isinstance(values, list) else None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: put(g, "outputs", np.array([0, 1])), "outputs must be three slots"),
+        (lambda g: put(g, "outputs", np.array([-1, -1, -1])), "outputs are -1"),
+        (lambda g: put(g, "outputs", np.array([0, 99, -1])), "outputs are 0, 99"),
+        (lambda g: put(g, "sizes", g["sizes"][()] + 1), "sizes are not those of its instructions' results"),
+        (lambda g: put(g, "operand_begin", g["operand_begin"][()][::-1]), "operand_begin does not take operands apart"),
+        (lambda g: put(g, "operand_begin", g["operand_begin"][()][:-1]), "with"),
+        (lambda g: put(g, "numbers", g["numbers"][()][:-1]), "number_begin does not take numbers apart"),
+        (lambda g: put(g, "numbers", g["numbers"][()].astype("f4")), "must be a list of float64"),
+        (lambda g: put(g, "operands", np.full_like(g["operands"][()], 10**9)), "only earlier ones are there"),
+        (lambda g: put(g, "kinds", g["kinds"].asstr()[()][:-1].tolist()), "must be a list of int64 with"),
+        (lambda g: put(g, "kinds", [*g["kinds"].asstr()[:-1], "x" * 10**6]), "there is no such instruction"),
+    ],
+)
+def test_a_program_that_makes_no_sense_is_refused(change, message, certificate, mutate, tmp_path):
+    with pytest.raises(ArtifactError) as error:
+        check(mutate(certificate, tmp_path / "mutant.h5", lambda file: change(file[STEP])))
+    assert message in str(error.value) and len(str(error.value)) < 400
+
+
+def hostile(kinds, reads, numbers=(), entries=(), outputs=(0, -1, -1)):
+    """A program of any lines, with the constants and entries of the last one."""
+
+    def change(file):
+        group, count = file[STEP], len(kinds)
+        put(group, "kinds", list(kinds))
+        put(group, "sizes", np.full(count, 4))
+        put(group, "operand_begin", np.cumsum([0, *map(len, reads)]))
+        put(group, "operands", np.array([r for some in reads for r in some], np.int64))
+        for name, begin, values in (("numbers", "number_begin", numbers), ("indices", "index_begin", entries)):
+            put(group, begin, np.array([0] * count + [len(values)]))
+            put(group, name, np.array(values, np.float64 if name == "numbers" else np.int64))
+        put(group, "outputs", np.array(outputs))
+
+    return change
+
+
+START, READS = ["state", "disturbance", "numbers"], [(), (), ()]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (hostile([*START, "neg"], [*READS, (3,)]), "only earlier ones are there"),
+        (hostile([*START, "neg", "neg"], [*READS, (4,), (3,)]), "only earlier ones are there"),
+        (hostile([*START, *["join"] * 60], [*READS, *[(i, i) for i in range(2, 62)]]), "more than 200000 entries"),
+        (hostile([*START, *["neg"] * 10_000], [*READS, *[(0,)] * 10_000]), "too many texts|more than 10000"),
+        (hostile([*START, *["sin"] * 9_000], [*READS, *[(i,) for i in range(2, 9_002)]]), "more than 20000000"),
+        (hostile([*START, "pick"], [*READS, (0,)], entries=[0] * 300_000), "more than 200000 entries"),
+        (hostile([*START, "constant"], [*READS, ()], numbers=[np.nan]), "its constants must be finite"),
+        (hostile([*START, "linear"], [*READS, (0,)], numbers=[np.inf] * 20), "its constants must be finite"),
+        (hostile([*START, "join"], [*READS, (0,) * 300_000]), "more than 200000 entries"),
+    ],
+)
+def test_a_hostile_program_ends_in_one_line_at_once(change, message, certificate, mutate, tmp_path):
+    path = mutate(certificate, tmp_path / "mutant.h5", change)
+    began = time.perf_counter()
+    with pytest.raises(ArtifactError) as error:
+        check(path)
+    assert time.perf_counter() - began < 10
+    assert any(m in str(error.value) for m in message.split("|"))
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
 def many_names(file):

@@ -290,7 +290,7 @@ def test_inspect_shows_kind_provenance_fields_and_verdicts(sagemp, made_up):
     fields = {f["name"]: f for f in found["fields"]}
     assert fields["tubes/references"]["holds"] == "float64 (1, 6, 4)"
     assert fields["tubes/clearance"]["units"] == "m"
-    assert fields["tracker/layers.0.bias"]["holds"] == "float64 (2,)"
+    assert fields["loop/lookahead"]["holds"] == "7" and found["claim"]["claims"][0][0] == "cannot be checked"
     assert found["verdicts"][0] == "VERIFIED"
     sagemp("train-planner", "--overwrite")
     assert "planner.h5 (changed since)" in sagemp("inspect", FOLDER / "certificate.h5").stdout

@@ -1,0 +1,257 @@
+"""What a file claims, in full and in units: for people who must see at a glance that it is an easier problem.
+
+Everything here is read off the numbers that a check is about: the sets, the scene, the program, the stored bounds.
+What is only said by the file and proved by nothing (its experiment, names, seconds) is kept apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sagemp_cli.checker.document import Document
+from sagemp_cli.checker.equations import Names, equations, matrix_of
+from sagemp_cli.checker.program import Program
+from sagemp_cli.checker.scene import SafeSet
+
+_NETWORK = 8  # rows and columns from which on a matrix is called a network's
+_MOST_REFERENCES = 12
+
+
+def claim_lines(document: Document, title: str) -> list[str]:
+    """The claim under a title, and what the file only says, for people."""
+    rows, said = claim_rows(document), said_rows(document)
+    width = max(len(label) for label, _ in (*rows, *said))
+    parts = ((title, rows), ("this is said by the file, not proved:", said))
+    return [line for name, some in parts for line in (name, *(f"  {label:{width}}  {text}" for label, text in some))]
+
+
+def claim_rows(document: Document) -> list[tuple[str, str]]:
+    """What a check is about, as pairs of what and how much."""
+    safe, sets = document.safe, document.sets
+    names, units = document.state_names, document.state_units
+    w_names = disturbance_names(document)
+    rows = [
+        ("for", f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {document.horizon} steps, at the samples"),
+        ("X_I", _box(*sets[0].corners(), names, units)),
+        ("W", _box(*sets[1].corners(), w_names, [""] * len(w_names))),
+        *[("w enters", text) for text in [_entrance(document)] if text],
+        *_models(document),
+    ]
+    tubes = document.tubes
+    safe_ones = [r for r, v in enumerate(tubes["verdict"]) if v == "SAFE"] or list(range(len(tubes["verdict"])))
+    rows.append(("proves", _aims(safe)))
+    if safe.workspace is not None:
+        places = [names[i] for i in document.position], [units[i] for i in document.position]
+        rows.append(("workspace", _box(*safe.workspace, *places)))
+    rows += [("obstacle", _obstacle(o)) for o in safe.obstacles]
+    if safe.goal is not None:
+        rows.append(("goal at K", _box(*safe.goal, names, units)))
+    if document.control_names and safe_ones:
+        lower, upper = tubes["control_lower"][safe_ones].min((0, 1)), tubes["control_upper"][safe_ones].max((0, 1))
+        rows.append(("controls", _box(lower, upper, document.control_names, document.control_units)))
+    if tubes["references"] is not None:
+        rows += [
+            (f"reference {r}", f"from {_point(reference[0], names)} to {_point(reference[-1], names)}")
+            for r, reference in enumerate(tubes["references"][:_MOST_REFERENCES])
+        ]
+        if len(tubes["references"]) > _MOST_REFERENCES:
+            rows.append(("references", f"{len(tubes['references']) - _MOST_REFERENCES} more"))
+    return rows
+
+
+def said_rows(document: Document) -> list[tuple[str, str]]:
+    """What the file says of itself and nothing proves."""
+    robot = document.config.get("dynamics")
+    said = {
+        **document.said,
+        "robot": str(robot.get("_target_", ""))[:80].rpartition(".")[2] if isinstance(robot, Mapping) else None,
+        "between samples": None if document.dt is None else f"{document.dt:.6g} s",
+        "names, units": "of states and controls",
+    }
+    return [(key, f"{value:.6g}" if isinstance(value, float) else str(value)) for key, value in said.items()
+            if value is not None]  # fmt: skip
+
+
+def equation_lines(document: Document) -> list[str]:
+    """The programs of a file as equations."""
+    names = Names(document.state_names, document.control_names, disturbance_names(document))
+    out: list[str] = []
+    for i, program in enumerate(document.programs):
+        if len(document.programs) > 1:
+            steps = np.flatnonzero(document.step_program == i)
+            out.append(f"steps {', '.join(map(str, steps[:8]))}{', ...' if len(steps) > 8 else ''}:")
+        out += equations(program, names)
+    if document.true_model is not None:
+        out += ["the analytical model, by way of the network:", *equations(document.true_model.programs[0], names)]
+    if document.lookahead:
+        n = len(names.states)
+        out.append(f"ref at step k: states k+1 to k+{document.lookahead} of the reference, {n} entries each, K at most")
+    return out
+
+
+def disturbance_names(document: Document) -> list[str]:
+    """``w_x`` for each state x if there are as many, else numbers."""
+    d, names = len(document.tubes["disturbance_lower"]), document.state_names
+    return [f"w_{name}" for name in names] if d == len(names) else [f"w_{i}" for i in range(d)]
+
+
+def _box(lower: Sequence[float], upper: Sequence[float], names: Sequence[str], units: Sequence[str]) -> str:
+    """Intervals with names and units; what has no ends is left out."""
+    parts = []
+    for a, b, name, unit in zip(lower, upper, names, units, strict=True):
+        low, high = float(a), float(b)
+        unit = f" {unit}" if unit not in ("", "1") else ""
+        if low == high:
+            parts.append(f"{name} {low:.6g}{unit}")
+        elif low == -np.inf and high == np.inf:
+            continue
+        elif high == np.inf:
+            parts.append(f"{name} from {low:.6g}{unit}")
+        elif low == -np.inf:
+            parts.append(f"{name} up to {high:.6g}{unit}")
+        else:
+            parts.append(f"{name} {low:.6g} to {high:.6g}{unit}")
+    return ", ".join(parts) or "no limits"
+
+
+def _point(values: np.ndarray, names: Sequence[str]) -> str:
+    return ", ".join(f"{name} {v:.4g}" for name, v in zip(names, values.tolist(), strict=True))
+
+
+def _obstacle(obstacle: tuple[str, str, list[float], Any]) -> str:
+    name, kind, first, second = obstacle
+    place = ", ".join(f"{v:.6g}" for v in first)
+    if kind == "ball":
+        return f"{name}: ball around ({place}), radius {second:.6g}"
+    return f"{name}: block from ({place}) to ({', '.join(f'{v:.6g}' for v in second)})"
+
+
+def _aims(safe: SafeSet) -> str:
+    """What a verdict of SAFE says."""
+    parts = ["x_k stays in its tube"]
+    if safe.workspace is not None:
+        parts.append("in the workspace")
+    parts.append(f"clear of {len(safe.obstacles)} obstacles" if safe.obstacles else "no obstacle is claimed")
+    parts.append("x_K is in the goal" if safe.goal is not None else "no goal is claimed")
+    return ", ".join(parts)
+
+
+def _models(document: Document) -> list[tuple[str, str]]:
+    """Where controls and the next state come from, of each program."""
+    out = []
+    for i, program in enumerate(document.programs):
+        where = f" {i}" if len(document.programs) > 1 else ""
+        behind = _behind(program, program.control) if program.control >= 0 else set()
+        if behind:
+            out.append((f"control{where}", _chain(program, sorted(behind))))
+        out.append((f"step{where}", _chain(program, sorted(_behind(program, program.next) - behind))))
+        out.append(
+            (f"program{where}", f"sha256 {program.fingerprint()[:16]}, its equations: sagemp inspect --equations")
+        )
+    return out
+
+
+def _behind(program: Program, slot: int) -> set[int]:
+    """The slots that one is made of."""
+    found: set[int] = set()
+    todo = [slot]
+    while todo:
+        s = todo.pop()
+        if s not in found:
+            found.add(s)
+            todo += program.instructions[s].reads
+    return found
+
+
+def _chain(program: Program, slots: Sequence[int]) -> str:
+    """What is done there, in order; whether there are matrices as large as a network's."""
+    words, constants, network = [], 0, False
+    for slot in slots:
+        instruction, width = program.instructions[slot], program.widths[slot]
+        constants += len(instruction.constants)
+        if instruction.kind == "linear":
+            columns = program.widths[instruction.reads[0]]
+            large = min(width, columns) > 1 and max(width, columns) >= _NETWORK
+            network |= large
+            words += [f"{width} x {columns}"] if large else []
+        else:
+            words += [name for name, _ in program.relaxed[slot]]
+    counted: list[list[Any]] = []
+    for word in words:
+        if counted and counted[-1][0] == word:
+            counted[-1][1] += 1
+        else:
+            counted.append([word, 1])
+    text = ", ".join(word if n == 1 else f"{n} {word}" for word, n in counted) or "linear"
+    kind = "a network" if network else "formulas"
+    return f"{kind} of {len(slots)} instructions and {constants} constants: {text}"
+
+
+def _entrance(document: Document) -> str:
+    """How w enters the next state, if as a fixed multiple."""
+    texts = []
+    for program in document.programs[:1]:
+        found = disturbed(program)
+        if found is None:
+            return "not as fixed multiples (see the equations)"
+        w = disturbance_names(document)
+        for name, row in zip(document.state_names, found, strict=True):
+            parts = [f"{v:.6g} {w[j]}" for j, v in enumerate(row) if v]
+            if parts:
+                texts.append(f"{name} + {' + '.join(parts)}")
+    return ", ".join(texts) or "nowhere"
+
+
+def disturbed(program: Program) -> np.ndarray | None:
+    """The matrix ``(n, d)`` that multiplies w in the next state, rounded; None if w enters in another way."""
+    found: list[np.ndarray | None] = []
+    d, values = program.disturbances, _constants(program)
+    for slot, instruction in enumerate(program.instructions):
+        parts = [found[r] for r in instruction.reads]
+        width, kind = program.widths[slot], instruction.kind
+        nothing = np.zeros((width, d))
+        if kind == "disturbance":
+            found.append(np.eye(d))
+        elif all(p is not None and not p.any() for p in parts):
+            found.append(nothing)
+        elif any(p is None for p in parts):
+            found.append(None)
+        else:
+            found.append(_carried(program, slot, parts, values))  # type: ignore[arg-type]
+    return found[program.next]
+
+
+def _carried(
+    program: Program, slot: int, parts: Sequence[np.ndarray], values: Sequence[np.ndarray | None]
+) -> np.ndarray | None:
+    """The same of an instruction of which an operand has w in it."""
+    instruction, width = program.instructions[slot], program.widths[slot]
+    kind = instruction.kind
+    if kind == "pick":
+        return parts[0][instruction.entries]
+    if kind == "join":
+        return np.concatenate(parts)
+    if kind == "linear":
+        return matrix_of(instruction, len(parts[0]))[0] @ parts[0]
+    if kind == "neg":
+        return -parts[0]
+    if kind == "identity":
+        return parts[0]
+    if kind in ("add", "sub"):
+        a, b = (np.broadcast_to(p, (width, p.shape[1])) for p in parts)
+        return a + b if kind == "add" else a - b
+    if kind in ("mul", "div"):
+        numbers = [values[r] for r in instruction.reads]
+        if kind == "mul" and numbers[0] is not None:
+            return numbers[0][:, None] * parts[1]
+        if numbers[1] is not None:
+            return parts[0] / numbers[1][:, None] if kind == "div" else parts[0] * numbers[1][:, None]
+    return None
+
+
+def _constants(program: Program) -> list[np.ndarray | None]:
+    """Values of the slots that are constant instructions."""
+    return [i.constants if i.kind == "constant" else None for i in program.instructions]

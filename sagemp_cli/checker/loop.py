@@ -1,0 +1,125 @@
+"""A program with everything done once that is the same at every step of a cell.
+
+Slots that are linear in the step's inputs (a tracker's errors and its first layer, states that formulas take apart)
+are one matrix over ``[1, x, w, numbers]`` each. What remains of them at a step is one column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sagemp_cli.checker.balls import arb, arb_mat, balls
+from sagemp_cli.checker.points import Point, value_of
+from sagemp_cli.checker.program import INPUTS, MOVES, Program
+from sagemp_cli.checker.rows import ZERO, Rows, Weights, column, combined, joined, weights_of
+
+ONE = arb(1)
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A program and its exact constants.
+
+    Attributes:
+        program: it.
+        constants: values of the slots that depend on no input.
+        linear: of the slots that are linear in the inputs and that others need, rows over ``[1, x, w, numbers]``.
+        known: whether a slot is one of these or stands behind them, so that no step computes it.
+        weights: of the other ``linear`` instructions.
+        last: the last slot that reads each slot.
+    """
+
+    program: Program
+    constants: Mapping[int, Point]
+    linear: Mapping[int, Rows]
+    known: tuple[bool, ...]
+    weights: Mapping[int, Weights]
+    last: tuple[int, ...]
+
+    @classmethod
+    def of(cls, program: Program) -> Folded:
+        """From a program."""
+        constants: dict[int, Point] = {}
+        linear: dict[int, Rows] = {}
+        weights: dict[int, Weights] = {}
+        count = len(program.widths)
+        outputs = [slot for slot in (program.next, program.control, program.deviation) if slot >= 0]
+        needed, last = set(outputs), [count] * count
+        for slot, instruction in enumerate(program.instructions):
+            reads = instruction.reads
+            for r in reads:
+                last[r] = slot
+            if not program.depends[slot]:
+                constants[slot] = value_of(instruction, [constants[r] for r in reads])
+            elif instruction.kind in INPUTS:
+                linear[slot] = _input(program, instruction.kind)
+            else:
+                if instruction.kind == "linear":
+                    weights[slot] = weights_of(instruction, program.widths[reads[0]])
+                if keeps_linear(program, slot) and all(r in linear or r in constants for r in reads):
+                    operands = [linear[r] if r in linear else column(constants[r]) for r in reads]
+                    linear[slot] = combined(instruction, operands, weights.pop(slot, None))
+                else:
+                    needed.update(reads)
+        for slot in outputs:
+            last[slot] = count
+        known = tuple(slot in constants or slot in linear for slot in range(count))
+        return cls(program, constants, {s: r for s, r in linear.items() if s in needed}, known, weights, tuple(last))
+
+
+class Loop:
+    """A program on the numbers of all steps, under one box of disturbances.
+
+    Args:
+        folded: the program.
+        windows: numbers of each step, ``(K, g)``.
+        lower, upper: W, exact.
+    """
+
+    def __init__(self, folded: Folded, windows: np.ndarray, lower: Point, upper: Point) -> None:
+        self.folded = folded
+        n, d, g = folded.program.states, folded.program.disturbances, folded.program.numbers
+        middle = [(a + b) / 2 for a, b in zip(lower, upper, strict=True)]
+        radius = [(b - a) / 2 for a, b in zip(lower, upper, strict=True)]
+        steps = range(len(windows))
+        given = [v for v in (ONE, *middle) for _ in steps]  # what the columns of 1 and w are multiplied by
+        known = arb_mat(1 + d + g, len(windows), [*given, *balls(windows.T.flat)])
+        self._columns, self._on_state, self._rest = {}, {}, {}
+        for slot, rows in folded.linear.items():
+            wide = [row + [ZERO] * (1 + n + d + g - len(row)) for row in rows]
+            self._columns[slot] = joined([[row[0], *row[1 + n :]] for row in wide]) * known
+            self._on_state[slot] = arb_mat(len(wide), n, [a for row in wide for a in row[1 : 1 + n]])
+            self._rest[slot] = [
+                _trimmed(row[1 : 1 + n] + [b * r for b, r in zip(row[1 + n : 1 + n + d], radius, strict=True)])
+                for row in wide
+            ]
+
+    def rows(self, slot: int, k: int, center: arb_mat) -> Rows:
+        """Rows of a linear slot at step k, where the states are around the ``center (n, 1)``."""
+        columns, at = self._columns[slot], self._on_state[slot] * center
+        return [[columns[i, k] + at[i, 0], *rest] for i, rest in enumerate(self._rest[slot])]
+
+
+def keeps_linear(program: Program, slot: int) -> bool:
+    """Whether a slot is linear in its operands, of which those that depend on nothing count as numbers."""
+    instruction = program.instructions[slot]
+    given = [program.depends[r] for r in instruction.reads]
+    kind = instruction.kind
+    return kind in MOVES or (kind == "mul" and not all(given)) or (kind == "div" and not given[1])
+
+
+def _trimmed(row: list) -> list:
+    """Without the zeros at its end."""
+    while row and row[-1] == 0:
+        row.pop()
+    return row
+
+
+def _input(program: Program, kind: str) -> Rows:
+    """An input of the step over ``[1, x, w, numbers]``."""
+    n, d, g = program.states, program.disturbances, program.numbers
+    first, count = {"state": (1, n), "disturbance": (1 + n, d), "numbers": (1 + n + d, g)}[kind]
+    return [[ZERO] * (first + i) + [ONE] for i in range(count)]

@@ -1,0 +1,237 @@
+"""One step of a program on a set of states, in balls: every value is a list of rows, one for each entry.
+
+Rows are those of :mod:`~sagemp_cli.checker.zonotope`, over the states, the disturbances and one variable for each
+recorded relaxation. What is linear acts on rows. A nonlinear operation takes the next recorded relaxations, *proves*
+that the recorded lines and radii enclose the function over the operand's own bounds, and gives its variables the radii
+that it found itself. So the record is never trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import repeat
+from typing import NamedTuple
+
+from sagemp_cli.checker.angle import Turned, angle_excess
+from sagemp_cli.checker.balls import arb, arb_mat, ball
+from sagemp_cli.checker.functions import FUNCTIONS
+from sagemp_cli.checker.loop import Loop, keeps_linear
+from sagemp_cli.checker.points import functions_of
+from sagemp_cli.checker.program import Instruction
+from sagemp_cli.checker.rows import ZERO, Row, Rows, added, column, combined, joined, repeated, subtracted, times
+from sagemp_cli.checker.unproved import Unproved
+from sagemp_cli.checker.zonotope import Zonotope
+
+_UNDERFLOW = 2.0**-800  # a recorded radius may be 0 instead; what goes on is the radius found here
+
+Excess = Callable[[arb, arb, arb], tuple[arb, arb]]
+"""Bounds of ``f(x) - slope x`` for all x of ``[lower, upper]``."""
+
+
+class Entry(NamedTuple):
+    """A recorded relaxation: slope (of a product the scale), offset, radius, and of an angle the direction."""
+
+    slope: float
+    offset: float
+    radius: float
+    cosine: float = 1.0
+    sine: float = 0.0
+
+
+class Step:
+    """The values of one step.
+
+    Args:
+        loop: what is evaluated.
+        k: which step.
+        states: the set at its beginning.
+        record: recorded relaxations in order.
+    """
+
+    def __init__(self, loop: Loop, k: int, states: Zonotope, record: Sequence[Entry]) -> None:
+        self._loop, self._k, self._states, self._record = loop, k, states, record
+        self._center = arb_mat(len(states.center), 1, states.center)
+        program = loop.folded.program
+        self._first = self._next = 1 + program.states + program.disturbances  # column of the first relaxation
+        self._inputs = self._first
+        self._values: dict[int, Rows] = {}
+
+    def run(self) -> tuple[Rows, Rows | None, Rows | None]:
+        """Rows of the next state, of the control, and of the deviation.
+
+        Raises:
+            Unproved: a recorded relaxation is wrong.
+        """
+        folded = self._loop.folded
+        for slot, instruction in enumerate(folded.program.instructions):
+            if folded.known[slot]:
+                continue
+            self._values[slot] = self._result(slot, instruction)
+            for r in instruction.reads:
+                if folded.last[r] == slot:
+                    self._values.pop(r, None)
+        program = folded.program
+        control, deviation = (self._rows(slot) if slot >= 0 else None for slot in (program.control, program.deviation))
+        return self._rows(program.next), control, deviation
+
+    def bounds(self, rows: Rows) -> list[tuple[arb, arb]]:
+        """Lower and upper bound of the value of every row."""
+        radii = self._states.radii(joined(rows, self._inputs))
+        return [((row[0] - r).lower(), (row[0] + r).upper()) for row, r in zip(rows, radii, strict=True)]
+
+    def image(self, rows: Rows) -> Zonotope:
+        """The set of the values of rows, over all variables of the step."""
+        return self._states.image(joined(rows, self._first + len(self._record)))
+
+    def _rows(self, slot: int) -> Rows:
+        """A slot's value; numbers are rows of one entry."""
+        folded = self._loop.folded
+        if slot in folded.constants:
+            return column(folded.constants[slot])
+        if slot not in self._values:
+            self._values[slot] = self._loop.rows(slot, self._k, self._center)
+        return self._values[slot]
+
+    def _result(self, slot: int, instruction: Instruction) -> Rows:
+        folded, kind = self._loop.folded, instruction.kind
+        operands = [self._rows(r) for r in instruction.reads]
+        given = [folded.program.depends[r] for r in instruction.reads]
+        if keeps_linear(folded.program, slot):
+            return combined(instruction, operands, folded.weights.get(slot))
+        if kind == "mul":
+            return self._product(*repeated(operands))
+        if kind == "div":
+            return self._quotient(*operands, numbers=not given[0])
+        if kind in ("maximum", "minimum"):
+            return self._extreme(kind, *operands) if all(given) else self._limited(kind, operands, given)
+        if kind == "atan2":
+            return self._angle(*repeated(operands))
+        functions = functions_of(instruction, len(operands[0]))
+        return self._relaxed(kind, operands[0], [f.excess for f in functions])
+
+    def _relaxed(self, name: str, rows: Rows, functions: Sequence[Excess]) -> Rows:
+        """A function of the value of every row."""
+        entries = self._take(len(rows))
+        slopes = [ball(e.slope) for e in entries]
+        bounds = self.bounds(rows)
+        found = [f(s, low, high) for f, s, (low, high) in zip(functions, slopes, bounds, strict=True)]
+        return [
+            self._put(name, times(row, slope), bounds, entry)
+            for row, slope, bounds, entry in zip(rows, slopes, found, entries, strict=True)
+        ]
+
+    def _product(self, left: Rows, right: Rows) -> Rows:
+        """Product of values whose deviations X and Y may be correlated: ``X Y = (P^2 - M^2) / 4`` with
+        ``P = l X + Y / l`` and ``M = l X - Y / l``, for the recorded scale l as for any other.
+        """
+        entries = self._take(len(left))
+        if not all(e.slope > 0 for e in entries):
+            raise Unproved("the scale of a product must be positive")
+        plus, minus = self._ends(left, right, [ball(e.slope) for e in entries])
+        out = []
+        for a, b, p, m, entry in zip(left, right, plus, minus, entries, strict=True):
+            row = added(times(a, b[0]), times(b, a[0]))
+            row[0] = a[0] * b[0]
+            out.append(self._put("product", row, (-(m**2) / 4, p**2 / 4), entry))
+        return out
+
+    def _ends(self, left: Rows, right: Rows, scales: Sequence[arb]) -> tuple[list[arb], list[arb]]:
+        """Radii of ``P = l X + Y / l`` and ``M = l X - Y / l``, X and Y the deviations of rows."""
+        pairs = [(times(a, s), times(b, 1 / s)) for a, b, s in zip(left, right, scales, strict=True)]
+        both = [added(x, y) for x, y in pairs] + [subtracted(x, y) for x, y in pairs]
+        radii = self._states.radii(joined(both, self._inputs))
+        return radii[: len(pairs)], radii[len(pairs) :]
+
+    def _quotient(self, left: Rows, right: Rows, *, numbers: bool) -> Rows:
+        """``a / b = q + (a - q b) (1 / b)``, for q near the centres' quotient as for any other; of a number a only
+        ``a (1 / b)``.
+        """
+        inverse = self._relaxed("reciprocal", right, [FUNCTIONS["reciprocal"].excess] * len(right))
+        left, right, inverse = repeated([left, right, inverse])
+        if numbers:
+            return [times(b, a[0]) for a, b in zip(left, inverse, strict=True)]
+        near = [(a[0] / b[0]).mid() for a, b in zip(left, right, strict=True)]
+        q = [ball(float(v)) if v.is_finite() else ZERO for v in near]
+        rest = [subtracted(a, times(b, v)) for a, b, v in zip(left, right, q, strict=True)]
+        out = self._product(rest, inverse)
+        for row, v in zip(out, q, strict=True):
+            row[0] = row[0] + v
+        return out
+
+    def _extreme(self, kind: str, left: Rows, right: Rows) -> Rows:
+        """``maximum(a, b) = b + relu(a - b)`` and ``minimum(a, b) = a - relu(a - b)``."""
+        left, right = repeated([left, right])
+        rest = [subtracted(a, b) for a, b in zip(left, right, strict=True)]
+        above = self._relaxed("relu", rest, [FUNCTIONS["relu"].excess] * len(rest))
+        if kind == "maximum":
+            return [added(b, c) for b, c in zip(right, above, strict=True)]
+        return [subtracted(a, c) for a, c in zip(left, above, strict=True)]
+
+    def _limited(self, kind: str, operands: Sequence[Rows], given: Sequence[bool]) -> Rows:
+        """The same with numbers on one side: a clamp."""
+        value, limits = repeated(operands if given[0] else operands[::-1])
+        return self._relaxed("clamp", value, [_limit(kind, c[0]) for c in limits])
+
+    def _angle(self, y: Rows, x: Rows) -> Rows:
+        """``atan2(y, x)``, around the recorded line of how far the point is across the recorded direction."""
+        entries = self._take(len(y))
+        cosines, sines = [ball(e.cosine) for e in entries], [ball(e.sine) for e in entries]
+        turns = list(zip(y, x, cosines, sines, strict=True))
+        across = [subtracted(times(b, c), times(a, s)) for b, a, c, s in turns]
+        along = [added(times(a, c), times(b, s)) for b, a, c, s in turns]
+        v, u = self.bounds(across), self.bounds(along)
+        scales = [_ratio(u[i][1] - u[i][0], v[i][1] - v[i][0]) for i in range(len(y))]
+        plus, minus = self._ends(across, along, scales)
+        boxes = list(zip(self.bounds(y), self.bounds(x), strict=True))
+        out = []
+        for i, entry in enumerate(entries):
+            turned = Turned(cosines[i], sines[i], v[i], u[i], across[i][0], along[i][0], plus[i], minus[i])
+            slope = ball(entry.slope)
+            found = angle_excess(slope, *boxes[i], turned)
+            out.append(self._put("atan2", times(across[i], slope), found, entry))
+        return out
+
+    def _take(self, count: int) -> Sequence[Entry]:
+        first = self._next - self._first
+        entries = self._record[first : first + count]
+        if len(entries) != count:
+            raise Unproved("the step takes more relaxations than are recorded")
+        return entries
+
+    def _put(self, name: str, row: Row, bounds: tuple[arb, arb], entry: Entry) -> Row:
+        """Add what lies within bounds to a row: the recorded offset and a new variable around it."""
+        least, most = bounds
+        offset = ball(entry.offset)
+        radius = (most - offset).max(offset - least).upper()
+        if not (radius <= ball(entry.radius) or radius <= ball(_UNDERFLOW)):
+            raise Unproved(
+                f"a recorded relaxation of '{name}' is wrong: its radius is {float(radius):.9g}, not {entry.radius:.9g}"
+            )
+        row[0] = row[0] + offset
+        row += repeat(ZERO, self._next - len(row))
+        row.append(radius)
+        self._next += 1
+        return row
+
+
+def _limit(kind: str, c: arb) -> Excess:
+    """``max(x, c) = c + relu(x - c)``, or ``min(x, c) = x - relu(x - c)``."""
+    relu = FUNCTIONS["relu"]
+
+    def above(slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+        least, most = relu.excess(slope, lower - c, upper - c)
+        shift = c * (1 - slope)
+        return least + shift, most + shift
+
+    def below(slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+        least, most = relu.excess(1 - slope, lower - c, upper - c)
+        shift = c * (1 - slope)
+        return shift - most, shift - least
+
+    return above if kind == "maximum" else below
+
+
+def _ratio(a: arb, b: arb) -> arb:
+    """A number near the root of a quotient; 1 where there is none."""
+    root = (a / b).sqrt().mid()
+    return root if root.is_finite() and root > 0 else arb(1)

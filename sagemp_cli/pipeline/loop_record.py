@@ -1,0 +1,99 @@
+"""The closed loop of a claim as a certificate carries it: its step as a program, and what its numbers are called."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.dynamics.learned import Learned
+from sagemp_cli.errors import UsageError
+from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.loop.controller import Controller
+from sagemp_cli.problem import Problem
+from sagemp_cli.reachability.program.arithmetic import elementwise
+from sagemp_cli.reachability.program.loops import RecordedLoop, record, recorded
+from sagemp_cli.reachability.program.stored import to_record
+from sagemp_cli.storage import LoopRecord, ProgramRecord
+from sagemp_cli.verification.deviation import FOLDED
+
+
+def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
+    """The loop of a problem under a tracker; the same whatever the references."""
+    dynamics = problem.dynamics
+    return LoopRecord(
+        programs=tuple(map(to_record, recorded(_loop(problem, tracker), problem.start, problem.disturbance).programs)),
+        step_program=np.zeros(problem.horizon, np.int64),
+        lookahead=tracker.lookahead,
+        state_names=dynamics.state_names,
+        state_units=dynamics.state_units,
+        control_names=dynamics.control_names,
+        control_units=dynamics.control_units,
+        position=np.array(dynamics.position, np.int64),
+        dt=dynamics.dt,
+    )
+
+
+def deviation_record(problem: Problem, tracker: Controller) -> ProgramRecord:
+    """The step of a learned robot's analytical model by way of the network: w enlarged by what the two differ by."""
+    robot, loop = problem.dynamics, _loop(problem, tracker)
+    assert isinstance(robot, Learned)
+    shape = loop.window(0).shape
+
+    def step(x: Tensor, w: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        u = loop.control_given(numbers.reshape(shape), x)
+        derivative, deviation = robot.compared(x, u)
+        return robot.advance(x, derivative, w + elementwise(FOLDED, deviation)), u, deviation
+
+    return to_record(record(step, problem.start.center, problem.disturbance.center, loop.window(0).reshape(-1)))
+
+
+def strangers_loop_record(
+    loop: RecordedLoop,
+    *,
+    state_names: Sequence[str] | None = None,
+    state_units: Sequence[str] | None = None,
+    position: Sequence[int] = (),
+    dt: float | None = None,
+) -> LoopRecord:
+    """A recorded loop of anybody's, without a reference.
+
+    Args:
+        loop: its programs; one for all steps, or one for each.
+        state_names, state_units: n words each; ``x0``, ``x1``, ... without units by default.
+        position: entries of the state that are the position in the scene, if there is one.
+        dt: seconds between samples, if that means anything.
+
+    Raises:
+        UsageError: its steps have numbers of their own, or the names are not one for each state.
+    """
+    if loop.numbers.shape[-1]:
+        raise UsageError("a loop whose steps have numbers of their own needs a reference to take them from")
+    n, programs = loop.state_dim, loop.programs
+    names = tuple(f"x{i}" for i in range(n)) if state_names is None else tuple(state_names)
+    units = ("",) * n if state_units is None else tuple(state_units)
+    if len(names) != n or len(units) != n:
+        raise UsageError(f"{n} states need as many names and units, found {len(names)} and {len(units)}")
+    control = programs[0].outputs.control
+    m = 0 if control is None else programs[0].instructions[control].size
+    which = np.arange(loop.horizon) if len(programs) > 1 else np.zeros(loop.horizon)
+    return LoopRecord(
+        programs=tuple(map(to_record, programs)),
+        step_program=which.astype(np.int64),
+        lookahead=0,
+        state_names=names,
+        state_units=units,
+        control_names=tuple(f"u{i}" for i in range(m)),
+        control_units=("",) * m,
+        position=np.array(list(position), np.int64),
+        dt=dt,
+    )
+
+
+def _loop(problem: Problem, tracker: Controller) -> ClosedLoop:
+    """On any reference."""
+    return ClosedLoop(
+        problem.dynamics, tracker, torch.zeros(problem.horizon + 1, problem.dynamics.state_dim, dtype=torch.float64)
+    )
