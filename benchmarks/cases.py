@@ -29,6 +29,7 @@ from sagemp_cli.progress import Progress, Silent, Task
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
+from sagemp_cli.trackers.losses import LossWeights
 from sagemp_cli.trackers.training import train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
 
@@ -265,7 +266,8 @@ def _references(recipe: Recipe, dynamics: Dynamics, scene: Scene, progress: Prog
 
 
 def _train(recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None) -> None:
-    options = {k: v for k, v in recipe.training.items() if k not in ("warm_up", "tube_steps")}
+    options = {k: v for k, v in recipe.training.items() if k not in ("warm_up", "tube_steps", "weights")}
+    options["weights"] = LossWeights(**recipe.training.get("weights", {}))
     last = {"tube": None if recipe.tube is None else TubeLoss(**recipe.tube)}
     last |= {k: v for k, v in recipe.training.items() if k == "tube_steps"}
     generator = torch.Generator().manual_seed(SEED)

@@ -76,7 +76,7 @@ class Binding:
         return node
 
 
-def target_class(section: Mapping[str, Any], where: str) -> Callable[..., Any]:
+def target_class(section: Any, where: str) -> Callable[..., Any]:
     """What a section's ``name`` stands for: a class, or of a planner also a function.
 
     Args:
@@ -150,7 +150,7 @@ def options_for(
     return bound
 
 
-def build(section: Mapping[str, Any], where: str, **extra: Any) -> Any:
+def build(section: Any, where: str, **extra: Any) -> Any:
     """Build the object that a config section describes; of a function, the function with these options.
 
     Args:

@@ -58,10 +58,13 @@ def planner_from(artifact: Artifact[PlannerModel]) -> StoredPlanner:
     config = artifact.header.config
     arguments = _arguments(artifact.record.arguments, artifact)
     try:
-        if hasattr(target_class(config["planner"], "planner"), "learns_from"):
-            module = build({**arguments, NAME: config["planner"].get(NAME)}, "planner")
+        section, horizon = config.get("planner"), config.get("horizon")
+        if hasattr(target_class(section, "planner"), "learns_from"):
+            module = build({**arguments, NAME: section[NAME]}, "planner")
+        elif isinstance(horizon, int):
+            module = planner_of(section, build(config.get("dynamics"), "dynamics"), horizon)
         else:
-            module = planner_of(config["planner"], build(config["dynamics"], "dynamics"), config["horizon"])
+            raise ConfigError(f"horizon must be a whole number, found {horizon!r}")
     except ConfigError as e:
         raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)
@@ -77,7 +80,7 @@ def robot_from(artifact: Artifact[DynamicsModel], robot: Learned) -> Learned:
 def stand_in(config: Mapping[str, Any]) -> str:
     """What takes the place of the real thing in an experiment's plans, in a few words; empty if nothing does."""
     from_file = config.get("verify", {}).get("file") is not None
-    said = getattr(target_class(config["planner"], "planner"), "stand_in", None)
+    said = getattr(target_class(config.get("planner"), "planner"), "stand_in", None)
     return "" if said is None or from_file else said(config["planner"])
 
 
@@ -118,9 +121,9 @@ def tracker_from(artifact: Artifact[TrackerModel]) -> Controller:
     """
     arguments, config = _arguments(artifact.record.arguments, artifact), artifact.header.config
     try:
-        section = {**arguments, NAME: config["tracker"].get(NAME)}
-        robot = "robot" in parameters_of(target_class(section, "tracker"))
-        module = build(section, "tracker", **({"robot": build(config["dynamics"], "dynamics")} if robot else {}))
+        wanted = parameters_of(target_class(config.get("tracker"), "tracker"))
+        robot = {"robot": build(config.get("dynamics"), "dynamics")} if "robot" in wanted else {}
+        module = build({**arguments, NAME: config["tracker"][NAME]}, "tracker", **robot)
     except ConfigError as e:
         raise ArtifactError(f"{artifact.path}: {e}") from None
     return _loaded(module, artifact.record.weights, artifact)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from sagemp_cli.config.composition import compose
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.pipeline.models import planner_from
 from sagemp_cli.plugins import registry
-from sagemp_cli.storage import Certificate, read_artifact
+from sagemp_cli.storage import Certificate, Header, PlannerModel, read_artifact, write_artifact
 from sagemp_cli.verification.executors import processes
 
 
@@ -96,3 +100,21 @@ def test_a_name_that_cannot_be_is_refused_and_nothing_is_written(sagemp, name, m
     refused = sagemp("init", name)
     assert refused.exit_code == 2 and message in refused.stderr
     assert [p.name for p in Path().iterdir()] == ["there"]
+
+
+def test_code_that_an_artifact_names_is_never_loaded(rover, example):
+    """Whatever a file says: a module, a path, a list of plugins; only names that are known here are looked up."""
+    Path("evil_plugin.py").write_text("from pathlib import Path\nPath('loaded').write_text('')\n")
+    for picked in ("evil_plugin", "evil_plugin.py", "evil_plugin:x", "./evil_plugin.py"):
+        config = compose([]) | {"plugins": ["evil_plugin.py", "evil_plugin"], "experiment": "./evil_plugin.py"}
+        config["planner"] = {"name": picked, "_target_": "evil_plugin.x", "path": "evil_plugin.py"}
+        config["dynamics"] = config["dynamics"] | {"name": picked}
+        header = Header(stage="verify", experiment="rover", config=config, seed=0)
+        path = write_artifact(Path("certificate.h5"), example(Certificate), header, overwrite=True)
+        for command in (("inspect", path), ("check", path)):
+            assert rover(*command).exit_code in (0, 2, 5), command
+        record = dataclasses.replace(example(PlannerModel), arguments="{}")
+        planner = write_artifact(Path("planner.h5"), record, header, overwrite=True)
+        with pytest.raises(ArtifactError, match="planner.h5: planner.name '.*': no such planner"):
+            planner_from(read_artifact(planner, PlannerModel))
+    assert not Path("loaded").exists() and "evil_plugin" not in sys.modules
