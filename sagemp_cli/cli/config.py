@@ -9,6 +9,7 @@ import typer
 
 from sagemp_cli.cli.command import Command, examples
 from sagemp_cli.cli.options import Overrides
+from sagemp_cli.cli.rows import rows_of, terminal_width
 from sagemp_cli.errors import ConfigError, UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Show, check and list the configuration.", rich_markup_mode="rich")
@@ -53,14 +54,15 @@ def list_options(overrides: Overrides = None) -> None:
     """List the config groups and their options; the ones in use are marked with a star."""
     from sagemp_cli.config.composition import chosen_options, config_file, groups, options_of
 
-    chosen = chosen_options(overrides or [])
+    chosen, width = chosen_options(overrides or []), terminal_width()
     for group in groups():
         typer.echo(group)
-        for option in options_of(group):
-            mark = "*" if chosen.get(group) == option else " "
-            path = config_file(group, option)
-            note = "a plugin" if path is None else _first_comment(path)
-            typer.echo(f"  {mark} {option:<30}{note}".rstrip())
+        options = options_of(group)
+        files = [config_file(group, option) for option in options]
+        notes = ["a plugin" if path is None else _first_comment(path) for path in files]
+        marked = [("  *" if chosen.get(group) == option else "   ", option) for option in options]
+        for line in rows_of([(f"{mark} {option:<28}",) for mark, option in marked], notes, width=width):
+            typer.echo(line)
 
 
 def _first_comment(path: Path) -> str:

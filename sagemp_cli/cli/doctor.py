@@ -88,6 +88,12 @@ def _test(option: str) -> dict[str, Any]:
     }
 
 
+def _absent(package: str, packages: dict[str, Any]) -> str:
+    """What is said of a package that is not installed; neuralsat carries an auto_LiRPA of its own."""
+    carried = package == "auto_LiRPA" and packages.get("neuralsat") is not None
+    return "not installed by itself; the one that neuralsat carries is used" if carried else "not installed"
+
+
 def _print(found: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -98,7 +104,7 @@ def _print(found: dict[str, Any]) -> None:
     for key, value in (
         ("sagemp", found["sagemp"]),
         ("python", f"{found['python']}, {found['machine']}"),
-        *((name, version or "not installed") for name, version in found["packages"].items()),
+        *((name, version or _absent(name, found["packages"])) for name, version in found["packages"].items()),
         ("config", found["config"]),
         (
             "threads",

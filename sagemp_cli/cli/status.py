@@ -6,8 +6,9 @@ import json
 
 import typer
 
-from sagemp_cli.cli.command import examples
+from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import Json, Overrides, Partitions, Seed, overrides_of
+from sagemp_cli.cli.rows import rows_of, terminal_width
 from sagemp_cli.cli.stage_command import context_of, maker
 
 EXAMPLES = examples(
@@ -15,7 +16,6 @@ EXAMPLES = examples(
     "sagemp status experiment=unicycle_node effort=demo",
     "sagemp status --json | jq '.files[].state'",
 )
-_STYLES = {"fresh": "green", "stale": "yellow", "missing": "dim", "damaged": "red"}
 
 
 def status(
@@ -52,25 +52,15 @@ def status(
             json.dumps({"experiment": context.config["name"], "folder": str(context.folder), "files": files}, indent=2)
         )
         return
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=200)  # nobody resizes a pipe: one line per file
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    for column in ("stage", "reads", "file", "state"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("note", overflow="fold")
+    made = {n: f"made {s.header.created_utc[:16].replace('T', ' ')} UTC" if s.header else "" for n, s in states.items()}
+    cells = [("stage", "reads", "file", "state")]
     for name, state in states.items():
-        made = f"made {state.header.created_utc[:16].replace('T', ' ')} UTC" if state.header else ""
-        table.add_row(
-            name,
-            ", ".join(states[i].stage.role for i in state.stage.inputs_in(context.config) if i in states) or "-",
-            state.path.name,
-            Text(str(state.freshness), style=_STYLES[state.freshness]),
-            Text(why[name] or made),
-        )
-    console.print(f"{context.config['name']} in {context.folder}", markup=False, highlight=False)
-    console.print(table)
+        reads = [states[i].stage.role for i in state.stage.inputs_in(context.config) if i in states]
+        cells.append((name, ", ".join(reads) or "-", state.path.name, str(state.freshness)))
+    notes = ["note", *(why[name] or made[name] for name in states)]
+    width = terminal_width()
+    lines = rows_of(cells, notes, width=width)
+    if width is not None and max(map(len, lines)) > width:  # a narrow terminal: what a stage reads goes first
+        lines = rows_of([(stage, file, state) for stage, _, file, state in cells], notes, width=width)
+    typer.echo(f"{context.config['name']} in {context.folder}")
+    typer.echo(printable("\n".join(lines)))
