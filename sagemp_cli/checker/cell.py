@@ -29,7 +29,6 @@ class CellClaim:
         control_lower, control_upper: ``(K, m)``; may be infinite.
         disturbance_lower, disturbance_upper: W.
         slope, offset, radius: ``(K, E)``.
-        direction: of the angles among them in order, ``(K, A, 2)``.
         kept: ``(K, bytes)`` or None.
         deviation: bounds of the output of that name, ``(K, n)``, or None.
     """
@@ -47,7 +46,6 @@ class CellClaim:
     slope: np.ndarray
     offset: np.ndarray
     radius: np.ndarray
-    direction: np.ndarray
     kept: np.ndarray | None
     deviation: np.ndarray | None
 
@@ -90,13 +88,8 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded]) -> str:
 
 def _record(claim: CellClaim, k: int, folded: Folded) -> list[Entry]:
     """The relaxations of a step; the file has room for the program that takes most."""
-    kinds = [kind for slot in folded.program.relaxed for kind, count in slot for _ in range(count)]
-    columns = (claim.slope[k].tolist(), claim.offset[k].tolist(), claim.radius[k].tolist())
-    directions = iter(claim.direction[k].tolist())
-    return [
-        Entry(*entry, *(next(directions) if kind == "atan2" else ()))
-        for kind, entry in zip(kinds, zip(*columns, strict=True), strict=False)
-    ]
+    columns = (part[k, : folded.program.relaxations].tolist() for part in (claim.slope, claim.offset, claim.radius))
+    return [Entry(*entry) for entry in zip(*columns, strict=True)]
 
 
 def _both(a: Bounds, b: Range) -> Bounds:

@@ -248,7 +248,7 @@ def _geometry(
                 raise Unproved("its tube is not finite")
             if tubes["step"][r] != -1 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
-            distances = clearances(safe, *(side[..., index].reshape(-1, len(index)) for side in (lower, upper)))
+            distances = clearances(safe, *(np.concatenate(side[..., index]) for side in (lower, upper)))
             for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
                 if not distance > 0:
                     raise Unproved(f"its tube is not clear of '{name}'")
@@ -331,7 +331,6 @@ def _claim(document: Document, c: int) -> CellClaim:
         slope=found["slope"][c],
         offset=found["offset"][c],
         radius=found["radius"][c],
-        direction=found["direction"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
     )

@@ -34,8 +34,7 @@ class Document:
         config: the resolved config.
         said: what the file says of itself beside its claim: experiment, stage, version, propagator and the like.
         tubes: datasets of ``/data/tubes`` by name, texts as lists of str; ``references`` is None if there are none.
-        relaxations: ``slope, offset, radius (cells, K, E)``, ``direction (cells, K, A, 2)`` and perhaps ``kept``; empty
-            if none are recorded.
+        relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``; empty if none are recorded.
         programs: the step, one program or several.
         step_program: which of them each step is, ``(K,)``.
         lookahead: N; 0 if the step has no numbers of its own.
@@ -295,7 +294,7 @@ def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
     _require_shapes(read, path)
     relaxations = {}
     if "relaxations" in tubes:
-        _require_known(tubes["relaxations"], "slope", "offset", "radius", "direction", "kept")
+        _require_known(tubes["relaxations"], "slope", "offset", "radius", "kept")
         relaxations = {name: _dataset(node) for name, node in tubes["relaxations"].items()}
     return {
         "tubes": read,
@@ -363,24 +362,13 @@ def _require_fitting(document: Document, path: Path) -> None:
         raise ArtifactError(f"{path}: /data/loop looks {document.lookahead} steps ahead, but there are no references")
     if not found:
         return
-    most, angles = (max(count(p) for p in document.programs) for count in (_entries, _angles))
+    most = max(program.relaxations for program in document.programs)
     wanted = (cells, rows - 1, most)
     for name in ("slope", "offset", "radius"):
         if found[name].shape != wanted or found[name].dtype != np.float64:
             raise ArtifactError(
                 f"{path}: /data/tubes/relaxations/{name} must be float64 of shape {wanted}, the steps' own"
             )
-    direction = found.setdefault("direction", np.zeros((cells, rows - 1, 0, 2)))
-    if direction.shape != (cells, rows - 1, angles, 2) or direction.dtype != np.float64:
-        raise ArtifactError(f"{path}: /data/tubes/relaxations/direction must be float64 of {angles} angles a step")
     kept = found.get("kept")
     if kept is not None and (kept.shape[:2] != wanted[:2] or kept.ndim != 3 or kept.dtype != np.uint8):
         raise ArtifactError(f"{path}: /data/tubes/relaxations/kept must be uint8 of shape {(*wanted[:2], 'bytes')}")
-
-
-def _entries(program: Program) -> int:
-    return program.relaxations
-
-
-def _angles(program: Program) -> int:
-    return sum(count for slot in program.relaxed for kind, count in slot if kind == "atan2")

@@ -125,8 +125,13 @@ class Program:
 
     @property
     def relaxations(self) -> int:
-        """Entries of all relaxations of a step, E."""
+        """Entries of all that is recorded of a step, E."""
         return sum(count for slot in self.relaxed for _, count in slot)
+
+    @property
+    def variables(self) -> int:
+        """How many variables these add; a direction adds none."""
+        return sum(count for slot in self.relaxed for name, count in slot if name != "direction")
 
     @property
     def controls(self) -> int:
@@ -249,7 +254,7 @@ def _relaxations(
         return (*divisor, ("product", width)) if all(given) else divisor
     if kind in ("maximum", "minimum"):
         return (("relu" if all(given) else "clamp", width),)
-    return ((kind, width),)
+    return (("atan2", width), ("direction", width)) if kind == "atan2" else ((kind, width),)
 
 
 def _few(slots: Sequence[int] | object) -> str:

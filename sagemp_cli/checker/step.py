@@ -29,13 +29,11 @@ Excess = Callable[[arb, arb, arb], tuple[arb, arb]]
 
 
 class Entry(NamedTuple):
-    """A recorded relaxation: slope (of a product the scale), offset, radius, and of an angle the direction."""
+    """A recorded relaxation: slope (of a product the scale), offset, radius; or a direction's cosine, sine and 0."""
 
     slope: float
     offset: float
     radius: float
-    cosine: float = 1.0
-    sine: float = 0.0
 
 
 class Step:
@@ -54,6 +52,7 @@ class Step:
         program = loop.folded.program
         self._first = self._next = 1 + program.states + program.disturbances  # column of the first relaxation
         self._inputs = self._first
+        self._taken = 0
         self._values: dict[int, Rows] = {}
 
     def run(self) -> tuple[Rows, Rows | None, Rows | None]:
@@ -81,7 +80,7 @@ class Step:
 
     def image(self, rows: Rows) -> Zonotope:
         """The set of the values of rows, over all variables of the step."""
-        return self._states.image(joined(rows, self._first + len(self._record)))
+        return self._states.image(joined(rows, self._first + self._loop.folded.program.variables))
 
     def _rows(self, slot: int) -> Rows:
         """A slot's value; numbers are rows of one entry."""
@@ -174,8 +173,8 @@ class Step:
 
     def _angle(self, y: Rows, x: Rows) -> Rows:
         """``atan2(y, x)``, around the recorded line of how far the point is across the recorded direction."""
-        entries = self._take(len(y))
-        cosines, sines = [ball(e.cosine) for e in entries], [ball(e.sine) for e in entries]
+        entries, directions = self._take(len(y)), self._take(len(y))
+        cosines, sines = [ball(d.slope) for d in directions], [ball(d.offset) for d in directions]
         turns = list(zip(y, x, cosines, sines, strict=True))
         across = [subtracted(times(b, c), times(a, s)) for b, a, c, s in turns]
         along = [added(times(a, c), times(b, s)) for b, a, c, s in turns]
@@ -192,8 +191,8 @@ class Step:
         return out
 
     def _take(self, count: int) -> Sequence[Entry]:
-        first = self._next - self._first
-        entries = self._record[first : first + count]
+        entries = self._record[self._taken : self._taken + count]
+        self._taken += count
         if len(entries) != count:
             raise Unproved("the step takes more relaxations than are recorded")
         return entries

@@ -13,7 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
+
+
+def recorded_bands(name: str, band: Band, turn: Turn | None) -> list[tuple[str, Band]]:
+    """What is kept of an operation: its band, and of an angle the direction that its line is across, written as one."""
+    if turn is None:
+        return [(name, band)]
+    return [(name, band), ("direction", Band(turn.cosine, turn.sine, 0.0 * turn.cosine))]
 
 
 @dataclass(frozen=True)

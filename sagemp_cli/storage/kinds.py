@@ -123,11 +123,6 @@ class Relaxations:
     slope: np.ndarray = array("cells K entries", "slope of each line (scale of a product)", finite=False)
     offset: np.ndarray = array("cells K entries", "offset of each line", finite=False)
     radius: np.ndarray = array("cells K entries", "greatest distance of the function from the line", finite=False)
-    direction: np.ndarray | None = array(
-        "cells K angles sides",
-        "of each 'atan2' among them, the direction that its line is across: cosine and sine",
-        optional=True,
-    )
     kept: np.ndarray | None = array(
         "cells K bytes", "which generators were kept after each step, one bit each", dtype="uint8", optional=True
     )

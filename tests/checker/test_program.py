@@ -78,10 +78,10 @@ def doubling(levels):
     ],
 )
 def test_a_program_that_nobody_could_check_is_refused_at_once(lines, message):
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(ValueError, match=message):
         Program.of(lines, {"next": 0}, states=2, disturbances=1, numbers=0)
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
 
 
 def test_relaxations_are_those_of_the_specification_in_its_order():
@@ -92,7 +92,8 @@ def test_relaxations_are_those_of_the_specification_in_its_order():
         line("linear", 0, constants=[0.0] * 6), line("identity", 1), next=0,
     )  # fmt: skip
     assert [r for slot in made.relaxed for r in slot] == [
-        ("product", 2), ("reciprocal", 2), ("reciprocal", 2), ("product", 2), ("clamp", 2), ("relu", 2), ("atan2", 2),
+        ("product", 2), ("reciprocal", 2), ("reciprocal", 2), ("product", 2), ("clamp", 2), ("relu", 2),
+        ("atan2", 2), ("direction", 2),
         ("pow", 2), ("clamp", 2), ("identity", 1),
     ]  # fmt: skip
 

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.form import ANGLE, Form, Operation
+from sagemp_cli.reachability.recording import recorded_bands
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
@@ -199,8 +200,8 @@ class StepFrame:
 
     @property
     def bands(self) -> list[tuple[str, Band]]:
-        """Names and bands of the operations, in the order of evaluation."""
-        return [(r.name, r.band) for r in self.relaxations]
+        """Names and bands of the operations, in the order of evaluation, and directions of angles."""
+        return [pair for r in self.relaxations for pair in recorded_bands(r.name, r.band, r.turn)]
 
     def hint(self, name: str, shape: torch.Size) -> Hint | None:
         """What is known of the next operation."""

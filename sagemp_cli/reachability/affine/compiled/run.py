@@ -35,6 +35,7 @@ from sagemp_cli.reachability.affine.compiled.operations import (
 from sagemp_cli.reachability.affine.compiled.steps import KeptStep, forms_of
 from sagemp_cli.reachability.affine.form import SAFETY, AffineForm, Hints
 from sagemp_cli.reachability.interval.operands import sharper
+from sagemp_cli.reachability.recording import recorded_bands
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.order_reduction import reduce_arrays
@@ -105,7 +106,8 @@ def planned_run(
             known = sharper(plan.step_on_sets(k), box, disturbance, known, where=in_batch(lost))
             states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
             after, control = plan.step(k, states)
-        found.bands.append([(r.name, Band(*map(in_batch, r.band))) for r in states.records])
+        kept = (pair for r in states.records for pair in recorded_bands(r.name, r.band, r.turn))
+        found.bands.append([(name, Band(*map(in_batch, band))) for name, band in kept])
         if watch and control is not None:
             found.controls.append(tuple(map(in_batch, states.bounds(control))))
         if keep_steps:
