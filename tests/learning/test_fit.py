@@ -9,6 +9,7 @@ from torch import nn
 
 from sagemp_cli.errors import ArtifactError, ConfigError, NonFiniteError
 from sagemp_cli.learning.fit import FINAL_SHARE, fit, learning_rate_at
+from sagemp_cli.progress import Silent
 
 TRUE = torch.tensor([[1.0, -2.0, 0.5]])
 
@@ -90,6 +91,24 @@ def test_a_resumed_run_ends_in_the_same_bits(tmp_path, step):
     reference = generator()
     fit(line(), regression, generator=reference, **OPTIONS)
     assert torch.equal(source.get_state(), reference.get_state())
+
+
+class Listener(Silent):
+    def __init__(self):
+        self.said = []
+
+    def say(self, text):
+        self.said.append(text)
+
+
+def test_a_resumed_run_says_where_it_goes_on(tmp_path):
+    path, fresh, resumed = tmp_path / "run.h5", Listener(), Listener()
+    options = OPTIONS | {"checkpoint": path, "description": "training it"}
+    with pytest.raises(KeyboardInterrupt):
+        fit(line(), interrupted_at(23), generator=generator(), progress=fresh, **options)
+    fit(line(), regression, generator=generator(), progress=resumed, **options)
+    assert fresh.said == []
+    assert resumed.said == ["training it: goes on from update 23 of 40"]
 
 
 def test_an_interrupt_while_validating_is_resumed_exactly(tmp_path):
