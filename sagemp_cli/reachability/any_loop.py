@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,19 +9,11 @@ from typing import Any
 import torch
 
 from sagemp_cli.errors import UsageError, did_you_mean
+from sagemp_cli.plugins.registry import names, resolve
 from sagemp_cli.reachability.observed import check_box, observed
 from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions
-
-PROPAGATORS = {
-    "affine": ("affine.affine", "Affine"),
-    "auto_lirpa": ("lirpa.auto_lirpa", "AutoLirpa"),
-    "best": ("crown.best", "Best"),
-    "crown": ("crown.crown", "Crown"),
-    "interval": ("interval.interval", "Interval"),
-}
-"""Name to module of this package and class."""
 
 AUTO_CELLS = 64
 """Cells at most with ``partitions="auto"``."""
@@ -65,7 +56,7 @@ def reach(
         disturbance: box ``(d,)`` of disturbances, anew at every step; d need not be n. None if there are none: the step
             may then be ``step(x)``, or gets a single 0 as ``w``.
         horizon: number of steps K; of a loop at most its own, and its own by default.
-        propagator: one of :data:`PROPAGATORS`, or a propagator itself.
+        propagator: a name that configs know (``affine``, ``best``, ...), or a propagator itself.
         partitions: cells of the start box in all, or counts per uncertain dimension (``"2x2"``, ``[2, 2]``), or
             ``"auto"``: from one cell on, the count is doubled in the dimension where that narrows the tube most, while
             it narrows it by 2 % at least, up to :data:`AUTO_CELLS` cells.
@@ -137,14 +128,13 @@ def _log_width(tube: Tube) -> float:
 
 def propagator_of(propagator: str | Propagator) -> Propagator:
     """A propagator, by name or itself."""
-    if not isinstance(propagator, str):
-        if not callable(getattr(propagator, "propagate", None)):
-            raise UsageError(f"propagator must be a name or have a method propagate, found {type(propagator).__name__}")
-        return propagator
-    if propagator not in PROPAGATORS:
-        raise UsageError(
-            f"propagator must be one of {', '.join(PROPAGATORS)}, found '{propagator}'"
-            f"{did_you_mean(propagator, PROPAGATORS)}"
-        )
-    module, name = PROPAGATORS[propagator]
-    return getattr(importlib.import_module(f"sagemp_cli.reachability.{module}"), name)()
+    if isinstance(propagator, str):
+        known = names("propagator")
+        if propagator not in known:
+            raise UsageError(
+                f"propagator must be one of {', '.join(known)}, found '{propagator}'{did_you_mean(propagator, known)}"
+            )
+        propagator = resolve("propagator", propagator, "propagator")()
+    if not isinstance(propagator, Propagator):
+        raise UsageError(f"propagator must be a name or a Propagator, found {type(propagator).__name__}")
+    return propagator

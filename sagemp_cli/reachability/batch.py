@@ -7,6 +7,7 @@ import torch
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
 
@@ -15,8 +16,8 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
     """The start box, broadcast against the batch of the loop's references.
 
     Args:
-        loop: a :class:`~.closed_loop.ClosedLoop`, folded or not, may have a batch; any other loop has none
-            of its own.
+        loop: a :class:`~.closed_loop.ClosedLoop`, folded or not, or a recorded loop may have a batch; any other loop
+            has none of its own.
         start: ``(..., n)``.
         disturbance: ``(d,)``.
 
@@ -33,5 +34,7 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
         own = loop.references.shape[:-2]
     elif isinstance(loop, FoldedLoop):
         own = loop.biases.shape[:-2]
+    elif isinstance(loop, RecordedLoop):
+        own = loop.batch
     shape = (*np.broadcast_shapes(own, start.lower.shape[:-1]), n)
     return Box(start.lower.expand(shape), start.upper.expand(shape))

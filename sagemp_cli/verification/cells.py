@@ -185,26 +185,19 @@ class CellProver:
         loop = ClosedLoop(self.problem.dynamics, self.tracker, chunk.references)
         began = time.perf_counter()
         with torch.no_grad(), one_thread():
-            tube, u_lower, u_upper, recording = self._bound(loop, chunk.cells)
+            found = self.propagator.reach(loop, chunk.cells, self.problem.disturbance, watch=True)
+            u_lower, u_upper = found.control_lower, found.control_upper
+            if u_lower is None or u_upper is None:
+                shape = (len(chunk), loop.horizon, loop.dynamics.control_dim)
+                u_upper = torch.full(shape, torch.inf, dtype=torch.float64)
+                u_lower = -u_upper
             least, most = self.tracker.control_range()
             more = (0, u_lower.shape[-1] - len(least))  # columns of a deviation, which may follow
             u_lower = torch.maximum(u_lower, torch.nn.functional.pad(least, more, value=-torch.inf))
             u_upper = torch.minimum(u_upper, torch.nn.functional.pad(most, more, value=torch.inf))
         share = (time.perf_counter() - began) / len(chunk)
         seconds = torch.full((len(chunk),), share, dtype=torch.float64)
-        return CellTubes(chunk.cell_reference, chunk.cells, tube, u_lower, u_upper, seconds, recording)
-
-    def _bound(self, loop: ClosedLoop, start: Box) -> tuple[Tube, Tensor, Tensor, Recording | None]:
-        """As much as the propagator offers: a tube, bounds of the controls, the relaxations."""
-        prove = getattr(self.propagator, "prove", None)
-        if prove is not None:
-            return prove(loop, start, self.problem.disturbance)
-        with_controls = getattr(self.propagator, "propagate_with_controls", None)
-        if with_controls is not None:
-            return *with_controls(loop, start, self.problem.disturbance), None
-        tube = self.propagator.propagate(loop, start, self.problem.disturbance)
-        unknown = torch.full((*tube.lower.shape[:-2], loop.horizon, loop.dynamics.control_dim), torch.inf)
-        return tube, -unknown.double(), unknown.double(), None
+        return CellTubes(chunk.cell_reference, chunk.cells, found.tube, u_lower, u_upper, seconds, found.recording)
 
 
 class Run(Protocol):

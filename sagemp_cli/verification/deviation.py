@@ -27,11 +27,11 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.form import Form, Operation
-from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.reachability.propagator import Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Box
 from sagemp_cli.sets.rounding import TINY, UNIT
 from sagemp_cli.verification.verification import Verification
 
@@ -40,10 +40,10 @@ FOLDED = "identity"
 
 
 @dataclass(frozen=True)
-class Folded:
+class Folded(Propagator):
     """Forward affine arithmetic on a learned robot's loop with the deviation folded into w.
 
-    It stands in the place of a propagator; its tubes are those of the analytical model. What others give as bounds of
+    Its tubes are those of the analytical model. What others give as bounds of
     the controls ``(*batch, K, m)`` here has ``m + n`` columns, the controls and then ``e``; :func:`split` takes them
     apart.
 
@@ -52,27 +52,23 @@ class Folded:
     """
 
     affine: Affine
-    name: str = "affine"
-    rigorous: bool = True
+    name: ClassVar[str] = Affine.name
+    rigorous: ClassVar[bool] = True
 
-    @property
-    def symbols(self) -> int | None:
-        """Generators that the propagator keeps; the memory it needs depends on that."""
-        return self.affine.symbols
-
-    def propagate(self, loop: ClosedLoop, start: Box, disturbance: Box) -> Tube:
-        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
-        return self.prove(loop, start, disturbance)[0]
-
-    def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
-        """Tube, bounds of controls and deviations, and what a certificate keeps of the proof.
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`.
 
         Raises:
             UsageError: the robot is not a learned one.
         """
-        if not isinstance(loop.dynamics, Learned):
-            raise UsageError(f"only a learned robot deviates from a model, found {type(loop.dynamics).__name__}")
-        return self.affine.prove(_FoldingLoop(loop), start, disturbance)
+        if not isinstance(loop, ClosedLoop) or not isinstance(loop.dynamics, Learned):
+            found = type(loop.dynamics if isinstance(loop, ClosedLoop) else loop).__name__
+            raise UsageError(f"only a learned robot deviates from a model, found {found}")
+        return self.affine.reach(_FoldingLoop(loop), start, disturbance, watch=watch)
+
+    def footprint(self, size: LoopSize) -> Footprint:
+        """That of the affine propagator."""
+        return self.affine.footprint(size)
 
 
 @dataclass(frozen=True)

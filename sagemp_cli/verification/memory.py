@@ -8,14 +8,13 @@ tests, and are meant to be above them.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ResourceError
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.propagator import Footprint, LoopSize, Propagator
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellProver, Chunk
 
@@ -26,60 +25,26 @@ MOST_AT_ONCE = 128
 HEAP = 4.5
 """Heap over arrays, as blocks of thousands of sizes leave gaps: 1 to 4.3 was measured, the most with 12 states."""
 
-_NUMBER = 8  # bytes of a float64
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """Bytes of one cell.
-
-    Attributes:
-        working: while it is propagated, given up afterwards; None if nothing is known of the propagator.
-        kept: of its tube and recorded relaxations.
-    """
-
-    working: float | None
-    kept: float
-
 
 @torch.no_grad()
 def footprint(prover: CellProver, reference: Tensor) -> Footprint:
     """What one cell of a reference ``(K+1, n)`` takes.
 
-    With n states, d disturbances, M generators at the last step, E entries of nonlinear operations a step (H of the
-    widest one) and v = n + d + E variables a step, in numbers of 8 bytes:
-
-    - kept, with m columns of bounds beside the states: ``2 (K+1) n + 2 K m + 3 K E`` and a bit per generator and step,
-      as many as if none were negligible;
-    - working, times :data:`HEAP`, of ``affine``: ``M (6 n + 3 H) + 12 v^2 + 2 kept``;
-    - of ``crown`` and ``best``: as ``affine``, ``K (3 v^2 + 2 v n)`` for the steps and ``6 rows v`` for the sweep;
-    - of ``interval``: ``40 v + 2 kept``.
+    The propagator says it of a loop of some size (:meth:`~sagemp_cli.reachability.propagator.Propagator.footprint`),
+    its working memory in arrays, which :data:`HEAP` makes memory; the size is that of the first step.
     """
     propagator, problem = prover.propagator, prover.problem
     steps, n, d = len(reference) - 1, problem.dynamics.state_dim, problem.disturbance.dim
-    shown = prover if hasattr(propagator, "prove") else dataclasses.replace(prover, propagator=Affine())
     middle = problem.start.center.reshape(-1, n)[:1]
     first = Chunk(0, torch.zeros(1, dtype=torch.int64), reference[None, :2], Box(middle, middle))
-    found = shown.prove(first)
+    found = prover.prove(first)
+    if found.recording is None:
+        found = dataclasses.replace(prover, propagator=Affine()).prove(first)
     assert found.recording is not None
-    entries, widest = found.recording.slope.shape[-1], max(found.recording.widths, default=1)
-    m = found.control_lower.shape[-1]
-    symbols = getattr(propagator, "symbols", None)
-    v = n + d + entries
-    generators = n + steps * v  # each step adds its disturbances, its relaxations and a column of rounding per state
-    generators = generators if symbols is None else min(generators, max(symbols, n + 1) + v)
-    kept = 2 * (steps + 1) * n + 2 * steps * m + 3 * steps * entries
-    kept += steps * generators / 64
-    working = {
-        "affine": generators * (6 * n + 3 * widest) + 12 * v**2 + 2 * kept,
-        "interval": 40 * v + 2 * kept,
-    }
-    rows = getattr(propagator, "rows", 0)
-    working["crown"] = working["best"] = (
-        working["affine"] + steps * (3 * v**2 + 2 * v * n) + 6 * min(rows, 2 * steps * n) * v
-    )
-    needed = working.get(propagator.name)
-    return Footprint(None if needed is None else HEAP * _NUMBER * needed, _NUMBER * kept)
+    controls = found.control_lower.shape[-1]
+    size = LoopSize.of(found.recording, steps, n, d, controls)
+    arrays = propagator.footprint(size)
+    return Footprint(None if arrays.working is None else HEAP * arrays.working, arrays.kept)
 
 
 def cells_within(memory: float, cells: int, found: Footprint, propagator: Propagator) -> int:

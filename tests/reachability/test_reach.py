@@ -17,10 +17,12 @@ import torch
 from torch import nn
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.plugins.registry import names
 from sagemp_cli.reachability import reach
-from sagemp_cli.reachability.any_loop import PROPAGATORS
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.lirpa.adapter import find
-from sagemp_cli.sets import Box
+from sagemp_cli.reachability.propagator import Propagator, Reach
+from sagemp_cli.sets import Box, Tube
 
 K = 6
 START = Box.around([0.3, -0.2, 0.4], [0.15, 0.1, 0.1])
@@ -384,7 +386,7 @@ def test_cells_are_never_taken_for_states(name):
         assert bool((tube.width <= whole.width + 1e-12).all())
 
 
-@pytest.mark.parametrize("propagator", [p for p in PROPAGATORS if p != "auto_lirpa"])
+@pytest.mark.parametrize("propagator", [p for p in names("propagator") if p != "auto_lirpa"])
 @pytest.mark.parametrize(
     "name", ["tanh network, float32", "unpacked", "in_place_from_zeros", "ignores_the_state", "quotient"]
 )
@@ -786,15 +788,12 @@ def test_a_box_of_negative_width_is_refused():
 
 
 def test_a_propagator_that_lies_is_caught_by_the_rollouts():
-    class Liar:
+    class Liar(Propagator):
         name, rigorous = "liar", True
 
-        def propagate(self, loop, start, disturbance):
-            from sagemp_cli.reachability.affine.affine import Affine
-            from sagemp_cli.sets import Tube
-
+        def reach(self, loop, start, disturbance, *, watch=False):
             tube = Affine().propagate(loop, start, disturbance)
-            return Tube(tube.lower + 0.4 * tube.width, tube.upper)
+            return Reach(Tube(tube.lower + 0.4 * tube.width, tube.upper))
 
     with pytest.raises(SagempError, match="a simulated rollout leaves the tube at step"):
         reach(RIGHT["unbound"], START, DISTURBANCE, K, propagator=Liar())

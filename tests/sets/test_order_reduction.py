@@ -69,7 +69,7 @@ def test_recordings_of_chunks_that_keep_different_generators_are_joined():
     for scale in (1.0, 1e-3):
         cell = (START.center[None], START.radius[None] * scale)
         box = type(START)(cell[0] - cell[1], cell[0] + cell[1])
-        parts.append(Affine().prove(loop, box, DISTURBANCE)[3])
+        parts.append(Affine().reach(loop, box, DISTURBANCE, watch=True).recording)
     joined = Recording.join(parts)
     size = joined.kept.shape[-1]
     assert size == max(p.kept.shape[-1] for p in parts)

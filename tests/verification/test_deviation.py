@@ -55,7 +55,8 @@ def rollouts(robot, loop):
 
 def test_tube_controls_and_deviations_enclose_the_analytical_loop(robot):
     loop = loop_of(robot)
-    tube, lower, upper, _ = Folded(Affine()).prove(loop, START, W)
+    found = Folded(Affine()).reach(loop, START, W, watch=True)
+    tube, lower, upper = found.tube, found.control_lower, found.control_upper
     widest = torch.zeros(STEPS, 4)
     for states, controls, deviation in rollouts(robot, loop):
         assert (states >= tube.lower - 1e-12).all() and (states <= tube.upper + 1e-12).all()
@@ -71,10 +72,12 @@ def test_on_arrays_the_proof_is_that_on_tensors(robot, monkeypatch):
         raise NotFoldable
 
     loop = loop_of(robot)
-    tube, *others, record = Folded(Affine()).prove(loop, START, W)
+    found = Folded(Affine()).reach(loop, START, W, watch=True)
     monkeypatch.setattr(affine, "planned_run", refuse)
-    slow, *slow_others, slow_record = Folded(Affine()).prove(loop, START, W)
-    for mine, theirs in zip((tube.lower, tube.upper, *others), (slow.lower, slow.upper, *slow_others), strict=True):
+    slow = Folded(Affine()).reach(loop, START, W, watch=True)
+    pairs = [(r.tube.lower, r.tube.upper, r.control_lower, r.control_upper) for r in (found, slow)]
+    record, slow_record = found.recording, slow.recording
+    for mine, theirs in zip(*pairs, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
     assert (record.operations, record.widths) == (slow_record.operations, slow_record.widths)
     assert record.operations.count("identity") == 1
@@ -98,7 +101,8 @@ def test_a_reduced_tube_is_sound_and_wider(robot):
 
 def test_an_exact_model_has_no_deviation_worth_speaking_of(learned_unicycle):
     robot = learned_unicycle(scale=1e-5)
-    _, lower, upper, _ = Folded(Affine()).prove(loop_of(robot), START, W)
+    found = Folded(Affine()).reach(loop_of(robot), START, W, watch=True)
+    lower, upper = found.control_lower, found.control_upper
     assert float(torch.maximum(-lower, upper)[:, 4:].max()) < 1e-6  # heading and speed, which the network has right
 
 
@@ -106,4 +110,4 @@ def test_a_robot_of_formulas_has_nothing_to_fold(learned_unicycle):
     robot = learned_unicycle().analytical
     assert isinstance(robot, Unicycle)
     with pytest.raises(UsageError, match="only a learned robot deviates from a model, found Unicycle"):
-        Folded(Affine()).prove(loop_of(robot), START, W)
+        Folded(Affine()).reach(loop_of(robot), START, W)

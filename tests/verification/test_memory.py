@@ -133,5 +133,5 @@ def test_too_small_a_budget_is_one_clear_error():
 
 def test_of_a_propagator_that_says_nothing_only_the_results_are_counted():
     found = needs(AutoLirpa())
-    assert found.working is None and found.kept == needs(Affine()).kept
+    assert found.working is None and 0 < found.kept < needs(Affine()).kept  # no recording
     assert cells_within(1.0, 100, found, AutoLirpa()) == MOST_AT_ONCE

@@ -9,6 +9,7 @@ from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.cells import CellProver
@@ -21,16 +22,16 @@ START, W = Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.2, 0.0, 0.0]), Box.around([0
 
 
 @dataclasses.dataclass(frozen=True)
-class Bare:
+class Bare(Propagator):
     """A propagator without control bounds, which counts its calls."""
 
     calls: list
-    name: str = "bare"
-    rigorous: bool = False
+    name = "bare"
+    rigorous = False
 
-    def propagate(self, loop, start, disturbance):
+    def reach(self, loop, start, disturbance, *, watch=False):
         self.calls.append(len(start.lower))
-        return Affine().propagate(loop, start, disturbance)
+        return Reach(Affine().propagate(loop, start, disturbance))
 
 
 @pytest.fixture

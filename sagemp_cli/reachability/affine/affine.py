@@ -18,7 +18,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -27,12 +27,11 @@ import sagemp_cli.reachability.affine.operations  # noqa: F401  (gives the forms
 import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the relaxations)
 from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError, UsageError
-from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
 from sagemp_cli.reachability.affine.compiled.run import planned_run
 from sagemp_cli.reachability.affine.form import AffineForm, Hints, StepFrame
 from sagemp_cli.reachability.interval.operands import sharper
-from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.sets import Box, Tube
@@ -64,7 +63,7 @@ class AffineRun:
 
 
 @dataclass(frozen=True)
-class Affine:
+class Affine(Propagator):
     """Forward affine arithmetic, rigorous.
 
     Attributes:
@@ -72,30 +71,35 @@ class Affine:
     """
 
     symbols: Count | None = None
-    name: str = "affine"
-    rigorous: bool = True
+    name: ClassVar[str] = "affine"
+    rigorous: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.symbols is not None and self.symbols < 1:
             raise ConfigError(f"propagator.symbols must be a positive integer or null, found {self.symbols}")
 
     @torch.no_grad()
-    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
-        return self._fast_run(loop, start, disturbance).tube
-
-    @torch.no_grad()
-    def propagate_with_controls(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor]:
-        """The tube and, per step, bounds of the controls ``(*batch, K, m)`` over it, from the same pass."""
-        return self.prove(loop, start, disturbance)[:3]
-
-    @torch.no_grad()
-    def prove(self, loop: ClosedLoop, start: Box, disturbance: Box) -> tuple[Tube, Tensor, Tensor, Recording]:
-        """As :meth:`propagate_with_controls`, with what a certificate keeps of the proof."""
-        run = self._fast_run(loop, start, disturbance, watch=True)
+        run = self._fast_run(loop, start, disturbance, watch=watch)
+        if not watch:
+            return Reach(run.tube)
         lower, upper = (torch.stack(side, dim=-2) for side in zip(*run.controls, strict=True))
         bad = torch.isnan(lower) | torch.isnan(upper)
-        return run.tube, torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper), run.recording()
+        lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
+        return Reach(run.tube, lower, upper, run.recording())
+
+    def footprint(self, size: LoopSize) -> Footprint:
+        """Of M generators at the last step, as many as if none were negligible: ``M (6 n + 3 H) + 12 v^2`` numbers and
+        twice what is kept, which is bounds, ``3 K E`` numbers of the recording and a bit per generator and step.
+        """
+        v, steps = size.variables, size.steps
+        generators = size.states + steps * v  # a step adds disturbances, relaxations, a column of rounding per state
+        if self.symbols is not None:
+            generators = min(generators, max(self.symbols, size.states + 1) + v)
+        kept = size.bounds + 3 * steps * size.entries + steps * generators / 64
+        working = generators * (6 * size.states + 3 * size.widest) + 12 * v**2 + 2 * kept
+        return Footprint(NUMBER * working, NUMBER * kept)
 
     def _fast_run(self, loop: Loop, start: Box, disturbance: Box, watch: bool = False) -> AffineRun:
         """:meth:`run` without autograd's bookkeeping; the tube is of ordinary tensors."""

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.crown.backward_steps import LEAD, Array, Inputs, Product, Replacement, Step
+from sagemp_cli.reachability.crown.steps import Extent, Steps
 from sagemp_cli.sets.rounding import TINY, UNIT
 
 
@@ -59,27 +60,27 @@ class Bounds:
 
 
 @np.errstate(all="ignore")  # what overflows is unbounded
-def backward(steps: Sequence[Step], radius: Tensor, *, targets: range, inputs: bool = False) -> Bounds:
+def backward(steps: Steps, radius: Tensor, *, targets: range, inputs: bool = False) -> Bounds:
     """Bounds of the states after the target steps (and of all operations' inputs in these steps) over the start box.
 
     Two sweeps, one with tilted and one with level planes over products; neither is always the better one.
 
     Args:
-        steps: from :func:`compiled`, step 0 first.
+        steps: all of them.
         radius: of the start box, ``(*batch, n)``.
         targets: the steps whose results are bounded.
         inputs: whether the operations' inputs are bounded too.
     """
     level = _swept(steps, radius, targets, inputs, False)
-    if all(r.product is None for step in steps for r in step.replacements):
+    if not any(extent.products for extent in steps.extents):
         return level
     return level.intersected(_swept(steps, radius, targets, inputs, True))
 
 
-def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, tilted: bool) -> Bounds:
+def _swept(steps: Steps, radius: Tensor, targets: range, inputs: bool, tilted: bool) -> Bounds:
     """All targets go back in one sweep; a target joins when the sweep comes by."""
     n = radius.shape[-1]
-    sweep = _Sweep(steps, radius.reshape(-1, n).numpy(), targets, inputs)
+    sweep = _Sweep(steps.extents, radius.reshape(-1, n).numpy(), targets, inputs)
     joined: list[tuple[int, Inputs | None, int]] = []  # step, inputs (None: the state), rows
     for k in range(targets.stop - 1, -1, -1):
         step = steps[k]
@@ -96,25 +97,25 @@ def _swept(steps: Sequence[Step], radius: Tensor, targets: range, inputs: bool, 
             if inputs and k in targets and r.inputs is not None:
                 joined.append((k, r.inputs, sweep.join(r.inputs)))
         sweep.leave(step.rounding)
-    return _collected(sweep.upper(), joined, targets, steps, radius.shape[:-1])
+    return _collected(sweep.upper(), joined, targets, steps.extents, radius.shape[:-1])
 
 
 class _Sweep:
     """The rows on their way, as columns of arrays that are made once.
 
     Args:
-        steps, targets, inputs: as for :func:`backward`.
+        extents: of the steps.
+        targets, inputs: as for :func:`backward`.
         radius: of the start box, ``(B, n)``.
     """
 
-    def __init__(self, steps: Sequence[Step], radius: Array, targets: range, inputs: bool) -> None:
+    def __init__(self, extents: Sequence[Extent], radius: Array, targets: range, inputs: bool) -> None:
         cells, n = radius.shape
         most = 2 * n * len(targets)
         if inputs:
-            most += sum(r.inputs.rows.shape[-1] for k in targets for r in steps[k].replacements if r.inputs)
-        passed = steps[: targets.stop]
-        width = max(step.output.shape[-2] for step in passed)
-        widest = max(r.last - r.first for step in passed for r in step.replacements)
+            most += sum(extents[k].inputs for k in targets)
+        passed = extents[: targets.stop]
+        width, widest = max(e.height for e in passed), max(e.widest for e in passed)
         self._radius, self._count = radius[:, None], 0
         self._constant, self._states = np.empty((cells, most)), np.empty((cells, n, most))
         self._values, self._scratch = np.empty((2, cells, width, most))
@@ -232,12 +233,12 @@ def _collected(
     upper: Array,
     joined: Sequence[tuple[int, Inputs | None, int]],
     targets: range,
-    steps: Sequence[Step],
+    extents: Sequence[Extent],
     batch: torch.Size,
 ) -> Bounds:
     """Upper bounds of rows and of minus the rows, as lower and upper bounds by step and operation."""
     states: list[Any] = [None] * len(targets)
-    found: list[list[Any]] = [[None] * len(steps[k].entries) for k in targets]
+    found: list[list[Any]] = [[None] * len(extents[k].entries) for k in targets]
     begin = 0
     for k, inputs, count in joined:
         high, low = np.split(upper[:, begin : begin + count], 2, axis=-1)
@@ -245,7 +246,7 @@ def _collected(
         if inputs is None:
             states[k - targets.start] = (-low, high)
             continue
-        lower = np.full((len(upper), steps[k].entries[inputs.operations[0]]), -math.inf)
+        lower = np.full((len(upper), extents[k].entries[inputs.operations[0]]), -math.inf)
         higher = -lower
         lower[:, inputs.entries], higher[:, inputs.entries] = -low, high
         bounds = tuple(torch.from_numpy(side).reshape(*batch, -1) for side in (lower, higher))

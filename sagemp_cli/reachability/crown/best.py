@@ -17,14 +17,15 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.affine.form import Hints
 from sagemp_cli.reachability.batch import batched_start
-from sagemp_cli.reachability.crown.crown import Crown, taken_back
-from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.blocks import in_blocks
+from sagemp_cli.reachability.crown.crown import Crown, cells_at_once, taken_back, taking_back
+from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 
 
 @dataclass(frozen=True)
-class Best:
-    """Affine arithmetic and CROWN sharpening each other; rigorous, as both are. Memory as for CROWN.
+class Best(Propagator):
+    """Affine arithmetic and CROWN sharpening each other; rigorous, as both are; as many cells at once as by CROWN.
 
     Attributes:
         rounds: forward and backward passes; where the set is wide, more than two still pay.
@@ -44,9 +45,16 @@ class Best:
             raise ConfigError(f"propagator.rounds must be a positive integer, found {self.rounds}")
 
     @torch.no_grad()
-    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
-        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none."""
         start = batched_start(loop, start, disturbance)
+
+        def bounded(some: Loop, cells: Box) -> Reach:
+            return Reach(self._tube(some, cells, disturbance))
+
+        return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
+
+    def _tube(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
         affine = Affine(symbols=self.symbols)
         hints: list[Hints] | None = None
         tubes: list[Tube] = []
@@ -57,6 +65,13 @@ class Best:
             tubes += [run.tube, back]
         lower, upper = (torch.stack(sides) for sides in zip(*((t.lower, t.upper) for t in tubes), strict=True))
         return Tube(lower.amax(0), upper.amin(0))
+
+    def footprint(self, size: LoopSize) -> Footprint:
+        """That of CROWN, and the bounds of all operations' inputs."""
+        rows = min(self.rows, 2 * size.steps * size.variables)
+        crown = taking_back(self.symbols, rows, size)
+        assert crown.working is not None
+        return Footprint(crown.working + 4 * NUMBER * size.steps * size.entries, crown.kept)
 
 
 def _sharper(old: list[Hints], new: list[Hints]) -> list[Hints]:

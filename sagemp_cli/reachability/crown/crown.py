@@ -18,19 +18,20 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine.affine import Affine, AffineRun
 from sagemp_cli.reachability.affine.form import Hint, Hints, Relaxed, StepFrame
 from sagemp_cli.reachability.batch import batched_start
+from sagemp_cli.reachability.blocks import in_blocks, some_of
 from sagemp_cli.reachability.crown.backward import backward
-from sagemp_cli.reachability.crown.backward_steps import compiled
-from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.crown.steps import BLOCK, KEPT, MAKING, Steps
+from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.rounding import UNIT
 
+AT_ONCE = 2**29
+"""Bytes that cells which are bounded together may take; of one cell, if it takes more."""
+
 
 @dataclass(frozen=True)
-class Crown:
-    """Backward linear bounds, rounding included.
-
-    Memory per cell, in float64 numbers: of the order of ``3 K v^2`` for the recorded steps, with v variables a
-    step (states, disturbances, one per relaxed entry), and ``5 v rows`` for the sweep.
+class Crown(Propagator):
+    """Backward linear bounds, rounding included. Cells are bounded as many at once as :data:`AT_ONCE` allows.
 
     Attributes:
         symbols: most generators that the forward pass keeps between steps (None: all).
@@ -48,11 +49,45 @@ class Crown:
             raise ConfigError(f"propagator.rows must be a positive integer, found {self.rows}")
 
     @torch.no_grad()
-    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
-        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none."""
         start = batched_start(loop, start, disturbance)
-        run = Affine(symbols=self.symbols).run(loop, start, disturbance, keep_steps=True)
-        return taken_back(run, start, rows=self.rows)[0]
+
+        def bounded(some: Loop, cells: Box) -> Reach:
+            run = Affine(symbols=self.symbols).run(some, cells, disturbance, keep_steps=True)
+            return Reach(taken_back(run, cells, rows=self.rows)[0])
+
+        return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
+
+    def footprint(self, size: LoopSize) -> Footprint:
+        """That of the forward pass, with ``2 K (v^2 + 2 n v)`` numbers for its steps; as much of the same made ready
+        as is kept so; and ``(2 v + 3 H + 2 n) rows`` for the sweep.
+        """
+        return taking_back(self.symbols, min(self.rows, 2 * size.steps * size.states), size)
+
+
+def taking_back(symbols: int | None, rows: int, size: LoopSize) -> Footprint:
+    """See :meth:`Crown.footprint`; for so many rows, of one step at least."""
+    v, n = size.variables, size.states
+    steps, making = 2 * NUMBER * size.steps * (v**2 + 2 * n * v), MAKING * NUMBER * v**2
+    ready = min(KEPT, 2 * steps) + min(max(BLOCK, making), size.steps * making)
+    sweep = NUMBER * max(rows, 2 * v) * (2 * v + 3 * size.widest + 2 * n)
+    forward = Affine(symbols=symbols).footprint(size)
+    assert forward.working is not None
+    return Footprint(forward.working + steps + ready + sweep, NUMBER * size.bounds)
+
+
+def cells_at_once(propagator: Propagator, loop: Loop, start: Box, disturbance: Box) -> int:
+    """Cells ``(..., n)`` that are bounded together, so that they take :data:`AT_ONCE` bytes; 1 at least."""
+    batch = start.lower.shape[:-1]
+    if batch.numel() == 1:
+        return 1
+    middle = start.center.reshape(-1, start.dim)[:1]
+    run = Affine().run(some_of(loop, batch, slice(0, 1)), Box(middle, middle), disturbance, horizon=1)
+    size = LoopSize.of(run.recording(), loop.horizon, start.dim, disturbance.dim)
+    needed = propagator.footprint(size).working
+    assert needed is not None
+    return max(1, int(AT_ONCE // needed))
 
 
 def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -> tuple[Tube, list[Hints]]:
@@ -64,10 +99,10 @@ def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -
         rows: most rows at once for one cell; at least one step's are taken.
         inputs: whether the operations' inputs are bounded too.
     """
-    steps = compiled(run.steps)
+    steps = Steps(run.steps)
     joining = 2 * start.dim
     if inputs:
-        joining += max(sum(r.inputs.rows.shape[-1] for r in s.replacements if r.inputs is not None) for s in steps)
+        joining += max(extent.inputs for extent in steps.extents)
     size = max(1, rows // joining)
     lowers, uppers, hints = [start.lower[..., None, :]], [start.upper[..., None, :]], []
     for first in range(0, len(steps), size):

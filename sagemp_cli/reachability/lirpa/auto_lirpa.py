@@ -15,14 +15,14 @@ from torch import Tensor
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.reachability.lirpa.adapter import METHODS, bound
-from sagemp_cli.reachability.propagator import Loop
+from sagemp_cli.reachability.propagator import Loop, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 
 MODES = ("one_shot", "one_step", "n_step")
 
 
 @dataclass(frozen=True)
-class AutoLirpa:
+class AutoLirpa(Propagator):
     """Tubes from backward CROWN; cells are one batch, references are done one after the other.
 
     One-shot walks back from every intermediate node of every step to the start, so its time grows with the square of
@@ -49,8 +49,8 @@ class AutoLirpa:
         if self.steps < 1:
             raise ConfigError(f"auto_lirpa: steps must be a positive integer, found {self.steps}")
 
-    def propagate(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
-        """Tubes around every rollout, see :class:`~sagemp_cli.reachability.propagator.Propagator`.
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none.
 
         Raises:
             UnsupportedOperationError: the loop uses an operation that auto_LiRPA cannot bound or bounds wrongly.
@@ -67,7 +67,8 @@ class AutoLirpa:
         if not isinstance(loop, ClosedLoop | FoldedLoop):
             cells = Box(start.lower.reshape(-1, n), start.upper.reshape(-1, n))
             low, high = self._cells(loop, cells, disturbance)
-            return Tube(low.reshape(*start.lower.shape[:-1], -1, n), high.reshape(*start.lower.shape[:-1], -1, n))
+            shape = (*start.lower.shape[:-1], -1, n)
+            return Reach(Tube(low.reshape(shape), high.reshape(shape)))
         own = "biases" if isinstance(loop, FoldedLoop) else "references"
         rows = getattr(loop, own).detach()
         batch = torch.broadcast_shapes(rows.shape[:-2], start.lower.shape[:-1])
@@ -82,7 +83,7 @@ class AutoLirpa:
             mine = which == r
             one = dataclasses.replace(loop, **{own: part})
             low[mine], high[mine] = self._cells(one, Box(lower[mine], upper[mine]), disturbance)
-        return Tube(low.reshape(*batch, -1, n), high.reshape(*batch, -1, n))
+        return Reach(Tube(low.reshape(*batch, -1, n), high.reshape(*batch, -1, n)))
 
     def _cells(self, loop: Loop, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
         """Tube corners ``(cells, K+1, n)`` of cells ``(cells, n)`` under one reference."""

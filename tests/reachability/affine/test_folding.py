@@ -134,7 +134,7 @@ def test_a_loop_that_overrides_its_step_is_bounded_as_it_steps():
             x = windy.step(k, x, disturbance.center)
             assert bool(((tube.lower[k + 1] <= x) & (x <= tube.upper[k + 1])).all())
     with pytest.raises(UsageError, match="Windy has a step of its own"):
-        Affine().prove(windy, start, disturbance)
+        Affine().reach(windy, start, disturbance, watch=True)
 
 
 class Sum:

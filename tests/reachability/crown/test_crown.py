@@ -11,11 +11,12 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.crown import backward_steps
-from sagemp_cli.reachability.crown import crown as crown_module
+from sagemp_cli.reachability.crown import steps as steps_module
 from sagemp_cli.reachability.crown.backward import _swept, _tilt
-from sagemp_cli.reachability.crown.backward_steps import Product, Step, compiled
+from sagemp_cli.reachability.crown.backward_steps import Product, Step
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.crown.steps import Steps
 from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.reachability.lirpa import adapter as lirpa_adapter
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
@@ -36,7 +37,7 @@ def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monk
         (EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.1] * 3), Box.around([0.0] * 3, [0.01] * 3)),
     ):
         run = Affine().run(loop, start, w, keep_steps=True)
-        low, high = _swept(compiled(run.steps), start.radius, range(loop.horizon), False, False).state
+        low, high = _swept(Steps(run.steps), start.radius, range(loop.horizon), False, False).state
         torch.testing.assert_close(high - low, run.tube.width[1:], rtol=1e-7, atol=1e-12)
 
 
@@ -117,8 +118,8 @@ def test_a_mistake_in_the_backward_pass_is_caught_by_an_attack(kind, monkeypatch
         return attack_tube(loop, start, w, tube, count=1500, generator=torch.Generator().manual_seed(4)).escapes
 
     assert attack() == 0
-    right = crown_module.compiled
-    monkeypatch.setattr(crown_module, "compiled", lambda steps: [broken(s, kind) for s in right(steps)])
+    right = steps_module.compiled
+    monkeypatch.setattr(steps_module, "compiled", lambda steps: [broken(s, kind) for s in right(steps)])
     assert attack() > 0
 
 
