@@ -768,7 +768,7 @@ POINT = Box.around([0.0], [0.0])
         ({"start": Box.around([[0.0], [1.0]], [0.1])}, r"start must be one box of shape \(n,\), found shape \(2, 1\)"),
         ({"disturbance": Box(torch.tensor([0.0]), torch.tensor([math.inf]))}, "disturbance box must be finite"),
         ({"propagator": "affin"}, r"propagator must be one of affine, .*found 'affin' \(did you mean 'affine'\?\)"),
-        ({"propagator": 3}, "propagator must be a name or have a method propagate, found int"),
+        ({"propagator": 3}, "propagator must be a name or a Propagator, found int"),
         ({"partitions": 0}, "partitions must be a positive number of cells"),
         ({"partitions": 4, "start": POINT}, "partitions must be 1 for a start box that is a point"),
         ({"cells_at_once": 0}, "cells_at_once must be a positive integer, found 0"),
