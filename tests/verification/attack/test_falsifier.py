@@ -243,3 +243,15 @@ def test_wrong_arguments_are_refused_in_one_line():
         search(scene(), restarts=0)
     with pytest.raises(UsageError, match="2 start boxes for 1 references"):
         search(scene(), start=Box(torch.zeros(2, 2), torch.ones(2, 2)))
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_faces_of_the_workspace_belong_to_it(side):
+    """Row 0 of a tube is the start itself, without rounding: on the face nothing is broken, beyond it something is."""
+    half = torch.tensor(0.5, dtype=torch.float64)
+    still = torch.zeros(10, 2, dtype=torch.float64)
+    problem = claim(scene(half=0.5), Box.around([0.0] * 2, [1.0] * 2), DISTURBANCE)
+    on = torch.stack([side * half, torch.zeros_like(half)])
+    beyond = torch.stack([side * torch.nextafter(half, half + 1), torch.zeros_like(half)])
+    assert not bool(violations(Drift(), on, still, problem)[0, 0])
+    assert bool(violations(Drift(), beyond, still, problem)[0, 0])
