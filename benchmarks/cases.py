@@ -25,12 +25,13 @@ from sagemp_cli.config.composition import compose
 from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.experts import Expert, Weights, plan_demonstrations, solve_problem
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent, Task
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers import Tracker
 from sagemp_cli.trackers.losses import LossWeights
-from sagemp_cli.trackers.training import train_tracker
+from sagemp_cli.trackers.training import TrackerTrainingOptions, train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
 
 SEED = 0
@@ -209,7 +210,10 @@ def load(name: str, folder: Path, *, progress: Progress | None = None) -> Case:
     arrays = _cached(path, recipe.digest)
     if arrays is None:
         references = _references(recipe, dynamics, scene, progress or Silent())
-        _train(recipe, tracker, dynamics, references, progress)
+        start = Box.around(recipe.start_center, recipe.start_radius)
+        disturbance = Box.around([0.0] * dynamics.state_dim, recipe.disturbance_radius)
+        problem = Problem(dynamics, scene, start, disturbance, recipe.horizon)
+        _train(recipe, tracker, problem, references, progress)
         arrays = {"references": references.numpy(), "digest": np.frombuffer(recipe.digest.encode(), dtype=np.uint8)}
         arrays |= {f"tracker/{k}": v.detach().numpy() for k, v in tracker.state_dict().items()}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -265,20 +269,12 @@ def _references(recipe: Recipe, dynamics: Dynamics, scene: Scene, progress: Prog
     return torch.from_numpy(np.stack(found))
 
 
-def _train(recipe: Recipe, tracker: Tracker, dynamics: Dynamics, references: Tensor, progress: Progress | None) -> None:
+def _train(recipe: Recipe, tracker: Tracker, problem: Problem, references: Tensor, progress: Progress | None) -> None:
     options = {k: v for k, v in recipe.training.items() if k not in ("warm_up", "tube_steps", "weights")}
     options["weights"] = LossWeights(**recipe.training.get("weights", {}))
     last = {"tube": None if recipe.tube is None else TubeLoss(**recipe.tube)}
     last |= {k: v for k, v in recipe.training.items() if k == "tube_steps"}
     generator = torch.Generator().manual_seed(SEED)
     for changes in (*recipe.training.get("warm_up", ()), last):
-        train_tracker(
-            tracker,
-            dynamics,
-            references=references,
-            start=Box.around(recipe.start_center, recipe.start_radius),
-            disturbance=Box.around([0.0] * dynamics.state_dim, recipe.disturbance_radius),
-            generator=generator,
-            progress=progress,
-            **(options | changes),
-        )
+        wanted = TrackerTrainingOptions(**(options | changes))
+        train_tracker(tracker, problem, wanted, references=references, generator=generator, progress=progress)

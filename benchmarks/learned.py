@@ -6,7 +6,7 @@ import torch
 
 from sagemp_cli.config.composition import compose
 from sagemp_cli.dynamics.learned import Learned
-from sagemp_cli.identification import EnclosureWeight, ModelErrors, learn_dynamics
+from sagemp_cli.identification import DynamicsTrainingOptions, EnclosureWeight, ModelErrors, learn_dynamics
 from sagemp_cli.pipeline.problem import robot_of
 
 
@@ -14,8 +14,9 @@ def learned_unicycle(*, seed: int = 0, updates: int = 1500) -> tuple[Learned, Mo
     """The robot of ``dynamics=unicycle_learned`` after a short training, and its errors."""
     config = compose(["dynamics=unicycle_learned"])
     options = dict(config["dynamics_training"]) | {"transitions": 200_000, "steps": updates}
-    enclosure = EnclosureWeight(**options.pop("enclosure"))
+    options["enclosure"] = EnclosureWeight(**options["enclosure"])
     robot = robot_of(config)
     assert isinstance(robot, Learned)
-    _, errors = learn_dynamics(robot, generator=torch.Generator().manual_seed(seed), enclosure=enclosure, **options)
+    generator = torch.Generator().manual_seed(seed)
+    _, errors = learn_dynamics(robot, DynamicsTrainingOptions(**options), generator=generator)
     return robot, errors

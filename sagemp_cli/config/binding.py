@@ -187,10 +187,17 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, tuple[inspect.Param
     for constructor in (cls.__init__ for cls in function.__mro__[:-1] if "__init__" in vars(cls)):
         _, *own = inspect.signature(constructor).parameters.values()
         named = {p.name: (p, constructor) for p in own if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+        if is_dataclass(function):  # each field's type is a name in the module of the class that declares it
+            named = {name: (p, _declaring(function, name)) for name, (p, _) in named.items()}
         found = named | found
         if not any(p.kind is p.VAR_KEYWORD for p in own):
             break
     return found
+
+
+def _declaring(function: type, field: str) -> Callable[..., Any]:
+    """The constructor of the dataclass that declares a field, or redeclares it last."""
+    return next(cls.__init__ for cls in function.__mro__ if field in vars(cls).get("__annotations__", {}))
 
 
 def _options_in(section: Mapping[str, Any]) -> dict[str, Any]:
@@ -225,7 +232,7 @@ def _bound(
         try:
             function(**bound)
         except UsageError as e:
-            wrong.append(str(e))
+            wrong.append(str(e) if str(e).startswith(where) else f"{where}: {e}")
     return bound, wrong
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,7 +14,9 @@ from sagemp_cli.dynamics.learned import Layers, Learned, perceptron
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.identification.enclosure_loss import enclosure_error
 from sagemp_cli.identification.transitions import Transitions, domain_of
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.learning.fit import History, fit
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.progress import Progress
 from sagemp_cli.sets import Box
 
@@ -63,20 +64,44 @@ class EnclosureWeight:
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class DynamicsTrainingOptions(Schedule):
+    """How a robot's network learns.
+
+    Attributes:
+        transitions: how many are drawn to learn from; the paper has 2e6 for the unicycle.
+        held_out: how many more are drawn, between the robot's limits, to measure the error.
+        margin: share of each range that learning goes beyond the limits: errors are largest at the edge of the data.
+        batch: transitions in an update.
+        enclosure: the second part of the loss; None for none.
+    """
+
+    steps: Count = 12_000
+    learning_rate: Positive = 5e-3
+    ema_decay: Decay | None = 0.995
+    transitions: Count = 2_000_000
+    held_out: Count = 100_000
+    margin: NonNegative = 0.1
+    batch: Count = 512
+    enclosure: EnclosureWeight | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("transitions", "held_out", "batch"):
+            if getattr(self, name) < 1:
+                raise ConfigError(
+                    f"dynamics_training.{name} must be a positive whole number, found {getattr(self, name)}"
+                )
+        if not 0 <= self.margin < float("inf"):
+            raise ConfigError(f"dynamics_training.margin must not be negative, found {self.margin}")
+
+
 def learn_dynamics(
     robot: Learned,
+    options: DynamicsTrainingOptions,
     *,
     generator: torch.Generator,
-    transitions: Count = 2_000_000,
-    held_out: Count = 100_000,
-    margin: NonNegative = 0.1,
-    steps: Count = 12_000,
-    batch: Count = 512,
-    learning_rate: Positive = 5e-3,
-    ema_decay: Decay | None = 0.995,
-    enclosure: EnclosureWeight | None = None,
-    checkpoint: Path | None = None,
-    identity: str = "",
+    resumable: Resumable | None = None,
     progress: Progress | None = None,
 ) -> tuple[History, ModelErrors]:
     """Fit the robot's network to its analytical model, in place: mean squared error of the increments, each state's
@@ -84,38 +109,29 @@ def learn_dynamics(
 
     Args:
         robot: what learns; its weights before do not matter.
+        options: what it learns from, and how long.
         generator: source of all randomness.
-        transitions: how many are drawn to learn from; the paper has 2e6 for the unicycle.
-        held_out: how many more are drawn, between the robot's limits, to measure the error.
-        margin: share of each range that learning goes beyond the limits: errors are largest at the edge of the data.
-        steps, batch, learning_rate, ema_decay: see :func:`sagemp_cli.learning.fit.fit`.
-        enclosure: the second part of the loss; None for none.
-        checkpoint, identity, progress: see :func:`~sagemp_cli.learning.fit.fit`.
+        resumable, progress: see :func:`~sagemp_cli.learning.fit.fit`.
 
     Returns:
         The course of training, with the validation's root mean square error per state in units of the state per second,
         and the errors of what the robot then holds.
     """
-    for name, value in (("transitions", transitions), ("held_out", held_out), ("batch", batch)):
-        if value < 1:
-            raise ConfigError(f"dynamics_training.{name} must be a positive whole number, found {value}")
-    if not 0 <= margin < float("inf"):
-        raise ConfigError(f"dynamics_training.margin must not be negative, found {margin}")
-    domain = domain_of(robot.analytical, margin)
-    data = Transitions.draw(robot.analytical, domain, transitions, generator)
-    unseen = Transitions.draw(robot.analytical, domain_of(robot.analytical), held_out, generator)
+    enclosure, domain = options.enclosure, domain_of(robot.analytical, options.margin)
+    data = Transitions.draw(robot.analytical, domain, options.transitions, generator)
+    unseen = Transitions.draw(robot.analytical, domain_of(robot.analytical), options.held_out, generator)
     network = _Network(robot, domain, data.increments, generator)
     inputs, targets = network.prepared(data)
     unseen_inputs, unseen_targets = network.prepared(unseen)
     del data
 
     def loss(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
-        chosen = torch.randint(len(inputs), (batch,), generator=generator)
+        chosen = torch.randint(len(inputs), (options.batch,), generator=generator)
         error = (module(inputs[chosen]) - targets[chosen]).square().mean()
         if enclosure is None:
             return error, {}
         cost = network.enclosure_cost(module, enclosure, generator)
-        weight = enclosure.weight * min(1.0, (step + 1) / (enclosure.start * steps))
+        weight = enclosure.weight * min(1.0, (step + 1) / (enclosure.start * options.steps))
         return error + weight * cost, {"squared error": float(error.detach()), "enclosure": float(cost.detach())}
 
     def validate(module: nn.Module) -> Mapping[str, float]:
@@ -125,13 +141,10 @@ def learn_dynamics(
     history = fit(
         network,
         loss,
-        steps=steps,
-        learning_rate=learning_rate,
-        ema_decay=ema_decay,
+        options,
         generator=generator,
         validate=validate,
-        checkpoint=checkpoint,
-        identity=identity,
+        resumable=resumable,
         progress=progress,
         description="learning the dynamics",
     )

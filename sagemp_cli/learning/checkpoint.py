@@ -22,6 +22,26 @@ _SCHEMA = "sagemp-checkpoint-1"
 
 
 @dataclass(frozen=True)
+class Resumable:
+    """Where a run keeps its checkpoint, so that it goes on from there when it was interrupted.
+
+    Attributes:
+        path: of the checkpoint; it is written every ``every_seconds`` and on Ctrl-C.
+        identity: what distinguishes this run from others beyond its schedule (a hash of config and data); a
+            checkpoint of another identity is refused.
+        every_seconds: see ``path``.
+    """
+
+    path: Path
+    identity: str = ""
+    every_seconds: float = 30.0
+
+    def part(self, name: str) -> Resumable:
+        """For a further run that belongs to the same work, in a file beside."""
+        return Resumable(self.path.with_name(f"{self.path.stem}-{name}{self.path.suffix}"), self.identity)
+
+
+@dataclass(frozen=True)
 class Checkpoint:
     """What a checkpoint holds.
 

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +23,9 @@ import torch
 from torch import Tensor, nn
 
 from sagemp_cli.errors import ArtifactError, ConfigError, NonFiniteError
-from sagemp_cli.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from sagemp_cli.learning.checkpoint import Checkpoint, Resumable, read_checkpoint, write_checkpoint
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.progress import Progress, Silent
-
-SCHEDULES = ("cosine", "constant")
-FINAL_SHARE = 0.01
-"""Share of the peak learning rate that the cosine ends at."""
 
 Loss = Callable[[nn.Module, int, torch.Generator], tuple[Tensor, Mapping[str, float]]]
 """``loss(module, step, generator)``: the scalar to minimise, and figures to show and record beside it.
@@ -36,9 +33,6 @@ Loss = Callable[[nn.Module, int, torch.Generator], tuple[Tensor, Mapping[str, fl
 Everything random (batches, noise) is drawn from ``generator``, whose state is part of a checkpoint; a loss that
 draws from torch's global generator cannot be resumed exactly.
 """
-
-GIVEN_TO_TRAINING = ("generator", "checkpoint", "identity", "progress")
-"""Arguments of :func:`fit` and of all that ends in it which a stage gives, and no config."""
 
 Validation = Callable[[nn.Module], Mapping[str, float]]
 """``validate(module)``: figures of the module in evaluation mode, without gradients; always the same names."""
@@ -75,37 +69,15 @@ class History:
         )
 
 
-def learning_rate_at(step: int, *, steps: int, peak: float, warmup: int, schedule: str) -> float:
-    """The learning rate of update ``step`` in ``0..steps-1``.
-
-    Linear from ``peak / (warmup + 1)`` to ``peak`` over ``warmup`` updates; then constant, or half a cosine
-    down to ``FINAL_SHARE * peak``, which the last update gets.
-    """
-    if step < warmup:
-        return peak * (step + 1) / (warmup + 1)
-    if schedule == "constant":
-        return peak
-    phase = (step - warmup) / max(1, steps - 1 - warmup)
-    return peak * (FINAL_SHARE + (1 - FINAL_SHARE) * 0.5 * (1 + math.cos(math.pi * min(1.0, phase))))
-
-
 def fit(
     module: nn.Module,
     loss: Loss,
+    schedule: Schedule,
     *,
-    steps: int,
-    learning_rate: float,
     generator: torch.Generator,
-    schedule: str = "cosine",
-    warmup: int | None = None,
-    weight_decay: float = 0.0,
-    clip_norm: float | None = 1.0,
-    ema_decay: float | None = None,
     validate: Validation | None = None,
     validate_every: int | None = None,
-    checkpoint: Path | None = None,
-    checkpoint_every_seconds: float = 30.0,
-    identity: str = "",
+    resumable: Resumable | None = None,
     progress: Progress | None = None,
     description: str = "training",
 ) -> History:
@@ -114,23 +86,12 @@ def fit(
     Args:
         module: what learns; parameters that do not require gradients stay as they are.
         loss: see :data:`Loss`.
-        steps: number of updates.
-        learning_rate: peak learning rate of Adam (AdamW where ``weight_decay`` is positive).
+        schedule: updates, learning rates and what is averaged; the average is what ``module`` holds in the end.
         generator: source of all randomness; its state afterwards is that of an uninterrupted run.
-        schedule: ``"cosine"`` or ``"constant"``, see :func:`learning_rate_at`.
-        warmup: number of warm-up updates; a twentieth of ``steps``, at most 100, if not given.
-        weight_decay: decoupled weight decay.
-        clip_norm: largest Euclidean norm of the gradient; ``None`` leaves gradients as they are.
-        ema_decay: keep an exponential moving average of the weights with this decay (its first updates average
-            over fewer steps, so that the initial weights are forgotten); the average is what is validated and
-            what ``module`` holds in the end. ``None`` validates and keeps the weights themselves.
-        validate: see :data:`Validation`; called every ``validate_every`` updates (a tenth of ``steps`` if not
-            given) and once at the end.
-        checkpoint: file that makes the run resumable. It is written every ``checkpoint_every_seconds`` and on
-            Ctrl-C; if it exists when the run starts, the run goes on from there. The caller deletes it once the
-            result is safe.
-        identity: what distinguishes this run from others beyond the arguments above (a hash of config and
-            data); a checkpoint of another identity is refused.
+        validate: see :data:`Validation`; called every ``validate_every`` updates (a tenth of all if not given) and
+            once at the end.
+        resumable: makes the run one that can be interrupted: if its checkpoint exists when the run starts, the run
+            goes on from there. The caller deletes it once the result is safe.
         progress: where the course is shown.
         description: what is being trained, for progress and errors.
 
@@ -139,16 +100,19 @@ def fit(
         ArtifactError: the checkpoint is damaged or belongs to another run.
         KeyboardInterrupt: after the checkpoint was written.
     """
-    warmup = min(100, steps // 20) if warmup is None else warmup
+    steps, ema_decay = schedule.steps, schedule.ema_decay
     validate_every = max(1, steps // 10) if validate_every is None else validate_every
-    _check(description, steps, learning_rate, schedule, warmup, ema_decay, validate_every)
+    if validate_every < 1:
+        raise ConfigError(f"{description}: validate_every must be positive, found {validate_every}")
     optimizer = torch.optim.AdamW(
-        [p for p in module.parameters() if p.requires_grad], lr=learning_rate, weight_decay=weight_decay
+        [p for p in module.parameters() if p.requires_grad],
+        lr=schedule.learning_rate,
+        weight_decay=schedule.weight_decay,
     )
     run = _Run(module, optimizer, generator, None if ema_decay is None else copy.deepcopy(module).eval())
-    identity = json.dumps(
-        [identity, steps, learning_rate, schedule, warmup, weight_decay, clip_norm, ema_decay, validate_every]
-    )
+    checkpoint, identity = (None, "") if resumable is None else (resumable.path, resumable.identity)
+    course = replace(schedule, warmup=schedule.warm_up)
+    identity = json.dumps([identity, *(getattr(course, f.name) for f in fields(Schedule)), validate_every])
     if checkpoint is not None and checkpoint.exists():
         run.restore(read_checkpoint(checkpoint, identity=identity), checkpoint)
         if progress is not None and 0 < run.done < steps:
@@ -170,11 +134,10 @@ def fit(
                     run.record_validation(validate)
                 if run.done == steps:
                     break
-                if checkpoint is not None and time.monotonic() - saved > checkpoint_every_seconds:
+                if resumable is not None and time.monotonic() - saved > resumable.every_seconds:
                     save()
                     saved = time.monotonic()
-                rate = learning_rate_at(run.done, steps=steps, peak=learning_rate, warmup=warmup, schedule=schedule)
-                run.update(loss, rate=rate, clip_norm=clip_norm, ema_decay=ema_decay, description=description)
+                run.update(loss, schedule, description)
                 if time.monotonic() - told > 0.1 or run.done == steps:
                     task.advance(run.done - done_when_told, run.note())
                     told, done_when_told = time.monotonic(), run.done
@@ -185,28 +148,6 @@ def fit(
         module.load_state_dict(run.average.state_dict())
     module.eval()
     return run.history()
-
-
-def _check(
-    description: str,
-    steps: int,
-    learning_rate: float,
-    schedule: str,
-    warmup: int,
-    ema_decay: float | None,
-    validate_every: int,
-) -> None:
-    if steps < 1 or validate_every < 1 or not 0 <= warmup < max(steps, 2):
-        raise ConfigError(
-            f"{description}: steps and validate_every must be positive and 0 <= warmup < steps, "
-            f"found {steps}, {validate_every} and {warmup}"
-        )
-    if not 0 < learning_rate < math.inf:
-        raise ConfigError(f"{description}: learning_rate must be a positive number, found {learning_rate}")
-    if schedule not in SCHEDULES:
-        raise ConfigError(f"{description}: schedule must be one of {SCHEDULES}, found '{schedule}'")
-    if ema_decay is not None and not 0 <= ema_decay < 1:
-        raise ConfigError(f"{description}: ema_decay must lie in [0, 1), found {ema_decay}")
 
 
 @dataclass
@@ -232,9 +173,8 @@ class _Run:
         """Number of finished updates."""
         return len(self.loss)
 
-    def update(
-        self, loss: Loss, *, rate: float, clip_norm: float | None, ema_decay: float | None, description: str
-    ) -> None:
+    def update(self, loss: Loss, schedule: Schedule, description: str) -> None:
+        rate, clip_norm, ema_decay = schedule.rate_at(self.done), schedule.clip_norm, schedule.ema_decay
         self.optimizer.zero_grad(set_to_none=True)
         value, figures = loss(self.module, self.done, self.generator)
         number = float(value.detach())

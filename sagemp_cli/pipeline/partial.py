@@ -14,6 +14,7 @@ import numpy as np
 
 from sagemp_cli import __version__
 from sagemp_cli.errors import ArtifactError, ResourceError
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.pipeline.claim import Claim, remove_unused
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.stage import stage_named
@@ -116,9 +117,9 @@ class PartialFile:
     identity: str
 
     @property
-    def path(self) -> Path:
-        """The file."""
-        return self.claim.folder / "checkpoint.h5"
+    def resumable(self) -> Resumable:
+        """The same as a training is given it."""
+        return Resumable(self.claim.folder / "checkpoint.h5", self.identity)
 
     @classmethod
     def of(cls, context: StageContext, stage: str, inputs: Inputs = ()) -> PartialFile:

@@ -6,7 +6,7 @@ from sagemp_cli.planners.figures import open_loop_figures, plan_figures, side_sh
 from sagemp_cli.planners.flow_matching import FlowMatching
 from sagemp_cli.planners.from_file import FromFile
 from sagemp_cli.planners.neural_ode import NeuralODE
-from sagemp_cli.planners.training import train_planner
+from sagemp_cli.planners.training import PlannerTrainingOptions, train_planner
 
 __all__ = [
     "Diffusion",
@@ -15,6 +15,7 @@ __all__ = [
     "LearnedPlanner",
     "NeuralODE",
     "Planner",
+    "PlannerTrainingOptions",
     "Proposer",
     "SelfTaughtPlanner",
     "StoredPlanner",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.learning.fit import History, Loss
 from sagemp_cli.progress import Progress
 from sagemp_cli.scenes.scene import Scene
@@ -91,22 +91,24 @@ class LearnedPlanner(StoredPlanner, Protocol):
 
 
 class SelfTaughtPlanner(StoredPlanner, Protocol):
-    """A planner that makes its own lessons: its ``learns_from`` is ``"scenes"``."""
+    """A planner that makes its own lessons: its ``learns_from`` is ``"scenes"``.
+
+    Attributes:
+        options_type: the dataclass that the config's ``planner_training`` becomes.
+    """
+
+    options_type: ClassVar[type]
 
     def learn(
         self,
+        options: Any,
         *,
         scene: Scene,
         generator: torch.Generator,
-        checkpoint: Path | None,
-        identity: str,
+        resumable: Resumable | None,
         progress: Progress | None,
-        **options: Any,
     ) -> History:
-        """Train in place; ``options`` are the config's ``planner_training``, bound to the class's own signature.
-
-        ``checkpoint``, ``identity`` and ``progress`` are as in :func:`sagemp_cli.learning.fit.fit`.
-        """
+        """Train in place; ``options`` are of :attr:`options_type`, the others as in :mod:`sagemp_cli.learning.fit`."""
         ...
 
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.config.ranges import Count, Decay, Positive
+from sagemp_cli.config.ranges import Decay, Positive
 from sagemp_cli.errors import NonFiniteError, UsageError
-from sagemp_cli.learning.fit import History, fit
+from sagemp_cli.learning.checkpoint import Resumable
+from sagemp_cli.learning.fit import History, Loss, fit
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.planners.base import LearnedPlanner
 from sagemp_cli.planners.figures import plan_figures
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress
-from sagemp_cli.scenes.scene import Scene
 
 PLANS = 200
 """Plans of a validation at least: as many from each held-out start as that takes."""
@@ -25,20 +27,28 @@ LOSS_BATCHES = 4
 """Batches that the loss on the held-out demonstrations is averaged over."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlannerTrainingOptions(Schedule):
+    """How a planner learns from demonstrations.
+
+    Attributes:
+        loss: options of the planner's ``loss_type``.
+    """
+
+    learning_rate: Positive = 1e-2
+    ema_decay: Decay | None = 0.995
+    loss: Mapping[str, Any] | None = None
+
+
 def train_planner(
     planner: LearnedPlanner,
     demonstrations: Tensor,
     *,
     held_out: Tensor,
-    scene: Scene,
-    position: tuple[int, ...],
+    problem: Problem,
+    options: PlannerTrainingOptions,
     generator: torch.Generator,
-    steps: Count,
-    learning_rate: Positive = 1e-2,
-    ema_decay: Decay | None = 0.995,
-    loss: Mapping[str, Any] | None = None,
-    checkpoint: Path | None = None,
-    identity: str = "",
+    resumable: Resumable | None = None,
     progress: Progress | None = None,
 ) -> History:
     """Train ``planner`` in place; validate it on the held-out demonstrations.
@@ -51,16 +61,10 @@ def train_planner(
         planner: what learns.
         demonstrations: ``(D, K+1, n)``, float64.
         held_out: demonstrations from other starts, ``(V, K+1, n)``.
-        scene: for the share of safe plans.
-        position: indices of the states that are the position.
+        problem: robot and scene, for the goal and the share of safe plans.
+        options: how long, and options of the loss.
         generator: source of all randomness.
-        steps: number of updates.
-        learning_rate: see :func:`sagemp_cli.learning.fit.fit`.
-        ema_decay: see there.
-        loss: options of the planner's ``loss_type``.
-        checkpoint: see there.
-        identity: see there.
-        progress: where the course is shown.
+        resumable, progress: see :func:`sagemp_cli.learning.fit.fit`.
 
     Raises:
         UsageError: demonstrations that do not fit the planner.
@@ -72,29 +76,29 @@ def train_planner(
             raise UsageError(f"{name} must have shape (count, {wanted[0]}, {wanted[1]}), found {tuple(data.shape)}")
         if not bool(torch.isfinite(data).all()):
             raise NonFiniteError(f"{name} contain NaN or infinity")
-    planner.prepare(demonstrations, goal=scene.goal, generator=generator)
-    options = {"steps": steps, **(loss or {})}
-    held_out_loss = planner.loss_type(planner, held_out, **options)
+    planner.prepare(demonstrations, goal=problem.scene.goal, generator=generator)
+
+    def loss_on(data: Tensor) -> Loss:
+        return planner.loss_type(planner, data, steps=options.steps, **(options.loss or {}))
+
+    held_out_loss, position = loss_on(held_out), problem.dynamics.position
     shown = held_out.repeat_interleave(math.ceil(PLANS / len(held_out)), dim=0)
     # Every validation draws the same numbers, so that its curve shows the planner's course and not chance.
     seed = int(torch.randint(2**31, (), generator=generator))
 
     def validate(subject: LearnedPlanner) -> Mapping[str, float]:
         drawn = torch.Generator().manual_seed(seed)
-        figures = plan_figures(subject, shown, scene=scene, position=position, generator=drawn)
-        losses = [float(held_out_loss(subject, steps - 1, drawn)[0]) for _ in range(LOSS_BATCHES)]
+        figures = plan_figures(subject, shown, scene=problem.scene, position=position, generator=drawn)
+        losses = [float(held_out_loss(subject, options.steps - 1, drawn)[0]) for _ in range(LOSS_BATCHES)]
         return {"held-out loss": sum(losses) / len(losses)} | figures
 
     return fit(
         planner,
-        planner.loss_type(planner, demonstrations, **options),
-        steps=steps,
-        learning_rate=learning_rate,
-        ema_decay=ema_decay,
+        loss_on(demonstrations),
+        options,
         generator=generator,
         validate=validate,
-        checkpoint=checkpoint,
-        identity=identity,
+        resumable=resumable,
         progress=progress,
         description="training the planner",
     )

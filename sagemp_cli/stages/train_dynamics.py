@@ -9,8 +9,7 @@ import numpy as np
 from sagemp_cli.config.binding import Binding
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.identification import learn_dynamics
-from sagemp_cli.learning.fit import GIVEN_TO_TRAINING
+from sagemp_cli.identification import DynamicsTrainingOptions, learn_dynamics
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import curve_of, figures_at_end, weights_of
 from sagemp_cli.pipeline.partial import PartialFile
@@ -19,7 +18,7 @@ from sagemp_cli.report.dynamics import draw_dynamics
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.storage import DynamicsModel
 
-SECTIONS = (Binding("dynamics_training", learn_dynamics, given=("robot", *GIVEN_TO_TRAINING)),)
+SECTIONS = (Binding("dynamics_training", DynamicsTrainingOptions),)
 
 
 def run(context: StageContext) -> Path:
@@ -37,11 +36,10 @@ def run(context: StageContext) -> Path:
     partial = PartialFile.of(context, "train-dynamics")
     history, errors = learn_dynamics(
         robot,
+        SECTIONS[0].made(context.config),
         generator=context.generator("train-dynamics"),
-        checkpoint=partial.path,
-        identity=partial.identity,
+        resumable=partial.resumable,
         progress=context.progress,
-        **SECTIONS[0].options(context.config),
     )
     figures = figures_at_end(history) | {"parameters": float(sum(p.numel() for p in robot.parameters()))}
     record = DynamicsModel(

@@ -15,13 +15,14 @@ import torch
 from sagemp_cli.config.binding import Binding, target_class
 from sagemp_cli.config.ranges import Fraction
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.learning.fit import GIVEN_TO_TRAINING, History
+from sagemp_cli.learning.fit import History
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import curve_of, figures_at_end, planner_of, weights_of
 from sagemp_cli.pipeline.partial import PartialFile
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.planners import (
     LearnedPlanner,
+    PlannerTrainingOptions,
     SelfTaughtPlanner,
     StoredPlanner,
     affordable,
@@ -39,6 +40,17 @@ TRAJECTORIES = "trajectories"
 
 _PLANS = 200
 """Plans that the model card of a planner without demonstrations is about, if it can afford them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(PlannerTrainingOptions):
+    """The section ``planner_training`` of planners that learn from demonstrations.
+
+    Attributes:
+        held_out: share of the demonstrations that is kept back for the validation curve.
+    """
+
+    held_out: Fraction
 
 
 @dataclass(frozen=True)
@@ -81,52 +93,48 @@ def sections(config: Mapping[str, Any]) -> tuple[Binding, ...]:
     planner = target_class(config["planner"], "planner")
     learns_from = getattr(planner, "learns_from", "nothing")
     if learns_from == "demonstrations":
-        about = ("planner", "demonstrations", "held_out", "scene", "position", *GIVEN_TO_TRAINING)
         return (
-            Binding("planner_training", train_planner, given=about, beside={"held_out": Fraction}),
+            Binding("planner_training", Options),
             Binding("planner_training.loss", planner.loss_type, given=("planner", "demonstrations", "steps")),
         )
     if learns_from == "scenes":
-        return (Binding("planner_training", planner.learn, given=("self", "scene", *GIVEN_TO_TRAINING)),)
+        return (Binding("planner_training", planner.options_type),)
     return ()
 
 
 def _from_demonstrations(context: StageContext, problem: Problem, planner: LearnedPlanner) -> _Outcome:
     """Train on the demonstrations except the last ones, which are held out for the validation curve."""
-    options = sections(context.config)[0].options(context.config)
-    share = options.pop("held_out")
+    options: Options = sections(context.config)[0].made(context.config)
     source = context.read("gen-data")
     states = torch.from_numpy(source.record.states)
-    kept = len(states) - math.ceil(share * len(states))
+    kept = len(states) - math.ceil(options.held_out * len(states))
     if kept < 1:
         raise ConfigError(f"{source.path}: {len(states)} demonstrations are too few to hold some out; set expert.count")
-    about = {"scene": problem.scene, "position": problem.dynamics.position}
     partial = PartialFile.of(context, "train-planner", (source,))
     history = train_planner(
         planner,
         states[:kept],
         held_out=states[kept:],
+        problem=problem,
+        options=options,
         generator=context.generator("train-planner"),
-        checkpoint=partial.path,
-        identity=partial.identity,
+        resumable=partial.resumable,
         progress=context.progress,
-        **about,
-        **options,
     )
-    shown = {f"demonstrated share {label}": s for label, s in sorted(side_shares(states[:kept], **about).items())}
+    shares = side_shares(states[:kept], scene=problem.scene, position=problem.dynamics.position)
+    shown = {f"demonstrated share {label}": share for label, share in sorted(shares.items())}
     return _Outcome(history, {"demonstrations": float(kept)} | figures_at_end(history) | shown, partial, (source,))
 
 
 def _from_scenes(context: StageContext, problem: Problem, planner: SelfTaughtPlanner) -> _Outcome:
-    """Let the planner make its own lessons; ``planner_training`` are the options of its ``learn``."""
+    """Let the planner make its own lessons."""
     partial = PartialFile.of(context, "train-planner")
     history = planner.learn(
+        sections(context.config)[0].made(context.config),
         scene=problem.scene,
         generator=context.generator("train-planner"),
-        checkpoint=partial.path,
-        identity=partial.identity,
+        resumable=partial.resumable,
         progress=context.progress,
-        **sections(context.config)[0].options(context.config),
     )
     return _Outcome(history, figures_at_end(history) | _card(context, problem, planner), partial)
 

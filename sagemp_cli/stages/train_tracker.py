@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from sagemp_cli.config.binding import Binding
 from sagemp_cli.config.ranges import Count
-from sagemp_cli.learning.fit import GIVEN_TO_TRAINING, History
+from sagemp_cli.learning.fit import History
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import curve_of, figures_at_end, planner_from, tracker_of, weights_of
@@ -20,10 +21,21 @@ from sagemp_cli.pipeline.problem import trained_problem
 from sagemp_cli.report.figure import draw_beside
 from sagemp_cli.report.training import draw_training
 from sagemp_cli.storage import TrackerModel
-from sagemp_cli.trackers.training import train_tracker
+from sagemp_cli.trackers.training import TrackerTrainingOptions, train_tracker
 
-_GIVEN = ("tracker", "dynamics", "references", "start", "disturbance", *GIVEN_TO_TRAINING)
-SECTIONS = (Binding("tracker_training", train_tracker, given=_GIVEN, beside={"references": Count}),)
+
+@dataclass(frozen=True, kw_only=True)
+class Options(TrackerTrainingOptions):
+    """The section ``tracker_training``.
+
+    Attributes:
+        references: sampled from the planner to train on.
+    """
+
+    references: Count
+
+
+SECTIONS = (Binding("tracker_training", Options),)
 
 _NOTHING_LEARNED = History(np.zeros(0), {}, np.zeros(0, np.int64), {})
 
@@ -33,8 +45,8 @@ def run(context: StageContext) -> Path:
 
     A tracker that was trained elsewhere is taken as it is.
     """
-    (problem, robot_files), options = trained_problem(context), SECTIONS[0].options(context.config)
-    count = options.pop("references")
+    (problem, robot_files), options = trained_problem(context), SECTIONS[0].made(context.config)
+    count = options.references
     with torch.random.fork_rng(devices=[]):  # initial weights depend on the root seed, whatever was drawn before
         torch.manual_seed(context.generator("train-tracker: initial weights").initial_seed())
         tracker, arguments = tracker_of(context.config["tracker"], problem.dynamics, problem.horizon)
@@ -52,15 +64,12 @@ def run(context: StageContext) -> Path:
     partial = PartialFile.of(context, "train-tracker", inputs)
     history = train_tracker(
         tracker,
-        problem.dynamics,
+        problem,
+        options,
         references=references,
-        start=problem.start,
-        disturbance=problem.disturbance,
         generator=context.generator("train-tracker"),
-        checkpoint=partial.path,
-        identity=partial.identity,
+        resumable=partial.resumable,
         progress=context.progress,
-        **options,
     )
     path = context.write("train-tracker", _record(tracker, arguments, history), inputs)
     partial.remove()

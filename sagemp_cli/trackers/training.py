@@ -7,18 +7,19 @@ small to full: the tracker learns to be verifiable, not only to track.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from sagemp_cli.config.ranges import Count, Positive, Whole
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.learning.fit import History, fit
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress
 from sagemp_cli.sets import Box
 from sagemp_cli.trackers.losses import LossWeights, rollout_loss
@@ -72,83 +73,79 @@ class RolloutSampler:
         return references, starts, w
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrackerTrainingOptions(Schedule):
+    """How a tracker learns.
+
+    Attributes:
+        batch: rollouts per step.
+        rollout_steps: steps H per rollout (at most K).
+        first_rollout_steps: steps per rollout at the beginning; they grow to ``rollout_steps`` by halfway. Rollouts of
+            an untrained tracker on a robot that tumbles leave every bound, and their gradients say nothing.
+        weights: of the loss's parts.
+        tube: reachability-aware part, None for the paper's plain loss.
+        tube_steps: further gradient steps with the reachability-aware part, from the plainly trained tracker.
+    """
+
+    learning_rate: Positive = 5e-3
+    batch: Count = 64
+    rollout_steps: Count = 40
+    first_rollout_steps: Count | None = None
+    weights: LossWeights | None = None
+    tube: TubeLoss | None = None
+    tube_steps: Whole = 150
+
+
 def train_tracker(
     tracker: Controller,
-    dynamics: Dynamics,
+    problem: Problem,
+    options: TrackerTrainingOptions,
     *,
     references: Tensor,
-    start: Box,
-    disturbance: Box,
     generator: torch.Generator,
-    steps: Count,
-    batch: Count = 64,
-    rollout_steps: Count = 40,
-    first_rollout_steps: Count | None = None,
-    learning_rate: Positive = 5e-3,
-    weights: LossWeights | None = None,
-    tube: TubeLoss | None = None,
-    tube_steps: Whole = 150,
-    checkpoint: Path | None = None,
-    identity: str = "",
+    resumable: Resumable | None = None,
     progress: Progress | None = None,
 ) -> History:
     """Train ``tracker`` in place.
 
     Args:
         tracker: the policy.
-        dynamics: the robot, differentiable.
+        problem: what will be proved: its robot is differentiable.
+        options: how long, on what and towards what.
         references: planner references ``(R, K+1, n)``.
-        start: ``X_I``.
-        disturbance: ``W``.
         generator: source of all randomness.
-        steps: gradient steps.
-        batch: rollouts per step.
-        rollout_steps: steps H per rollout (at most K).
-        first_rollout_steps: steps per rollout at the beginning; they grow to ``rollout_steps`` by halfway. Rollouts of
-            an untrained tracker on a robot that tumbles leave every bound, and their gradients say nothing.
-        learning_rate: peak learning rate.
-        weights: of the loss's parts.
-        tube: reachability-aware part, None for the paper's plain loss.
-        tube_steps: further gradient steps with the reachability-aware part, from the plainly trained tracker.
-        checkpoint, identity, progress: see :func:`sagemp_cli.learning.fit.fit`.
+        resumable, progress: see :func:`sagemp_cli.learning.fit.fit`.
     """
+    dynamics, tube, rollout_steps = problem.dynamics, options.tube, options.rollout_steps
     horizon = references.shape[1] - 1
     if not 1 <= rollout_steps <= horizon:
         raise ConfigError(f"tracker_training.rollout_steps must lie in 1..{horizon}, found {rollout_steps}")
-    first = rollout_steps if first_rollout_steps is None else first_rollout_steps
+    first = rollout_steps if options.first_rollout_steps is None else options.first_rollout_steps
     if not 1 <= first <= rollout_steps:
         raise ConfigError(f"tracker_training.first_rollout_steps must lie in 1..{rollout_steps}, found {first}")
-    loss_weights = weights or LossWeights()
+    loss_weights = options.weights or LossWeights()
     spread = 0.05 * (dynamics.state_upper - dynamics.state_lower)
-    sampler = RolloutSampler(references, start, disturbance, spread)
+    sampler = RolloutSampler(references, problem.start, problem.disturbance, spread)
 
     def tracking(module: nn.Module, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Controller)
-        drawn, x, w = sampler.draw(batch, length, generator)
+        drawn, x, w = sampler.draw(options.batch, length, generator)
         states, controls = ClosedLoop(dynamics, module, drawn).rollout(x, w)
         return rollout_loss(dynamics, states[:, 1:], controls, drawn[:, 1 : length + 1], loss_weights)
 
     def plain(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        share = min(1.0, 2 * step / steps)
+        share = min(1.0, 2 * step / options.steps)
         return tracking(module, round(first * (rollout_steps / first) ** share), generator)
 
     def with_tube(module: nn.Module, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Controller) and tube is not None
         value, figures = tracking(module, rollout_steps, generator)
-        share = step / max(1, tube_steps - 1)
-        width, more = tube(
-            module,
-            dynamics,
-            references=references,
-            start=start,
-            disturbance=disturbance,
-            share=share,
-            generator=generator,
-        )
+        share = step / max(1, options.tube_steps - 1)
+        width, more = tube(module, problem, references=references, share=share, generator=generator)
         return value + width, figures | more
 
-    common = {"learning_rate": learning_rate, "generator": generator, "identity": identity, "progress": progress}
-    history = fit(tracker, plain, steps=steps, checkpoint=checkpoint, description="training the tracker", **common)
+    about = {"generator": generator, "progress": progress}
+    history = fit(tracker, plain, options, resumable=resumable, description="training the tracker", **about)
     if tube is None:
         return history
     if progress is not None:
@@ -156,14 +153,6 @@ def train_tracker(
             f"the tube's width joins the loss, with sets that grow from {tube.shrink:.0%} of their size to all of it: "
             "so the loss rises now"
         )
-    later = None if checkpoint is None else checkpoint.with_name(f"{checkpoint.stem}-tube{checkpoint.suffix}")
-    return history.then(
-        fit(
-            tracker,
-            with_tube,
-            steps=tube_steps,
-            checkpoint=later,
-            description="training the tracker on its tubes",
-            **common,
-        )
-    )
+    later, last = replace(options, steps=options.tube_steps), None if resumable is None else resumable.part("tube")
+    more = fit(tracker, with_tube, later, resumable=last, description="training the tracker on its tubes", **about)
+    return history.then(more)

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.config.ranges import Count, NonNegative, Part, Positive
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
 
@@ -59,22 +59,20 @@ class TubeLoss:
     def __call__(
         self,
         tracker: Controller,
-        dynamics: Dynamics,
+        problem: Problem,
         *,
         references: Tensor,
-        start: Box,
-        disturbance: Box,
         share: float,
         generator: torch.Generator,
     ) -> tuple[Tensor, dict[str, float]]:
         """The loss at ``share`` (0..1) of the annealing, and its figures."""
         size = min(1.0, self.shrink + (1.0 - self.shrink) * share / 0.7)
         chosen = torch.randint(references.shape[0], (self.references,), generator=generator)
-        cells = self._cells(start, size, generator)
-        loop = ClosedLoop(dynamics, tracker, references[chosen])
+        cells = self._cells(problem.start, size, generator)
+        loop = ClosedLoop(problem.dynamics, tracker, references[chosen])
         around = references[chosen, 0]
         box = Box(around + cells.lower, around + cells.upper)
-        w = Box(disturbance.lower * size, disturbance.upper * size)
+        w = Box(problem.disturbance.lower * size, problem.disturbance.upper * size)
         steps = min(self.steps, loop.horizon)
         width = Affine(symbols=self.symbols).run(loop, box, w, horizon=steps).tube.width[:, 1:]
         fits = (width.detach() <= WIDEST).all(-1).all(0)

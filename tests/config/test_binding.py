@@ -12,6 +12,7 @@ from sagemp_cli.config.binding import Binding, build, option_complaints, options
 from sagemp_cli.config.ranges import Count, Decay, NonNegative, Positive, Widths
 from sagemp_cli.dynamics.unicycle import Unicycle
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.stages.train_tracker import Options as TrackerSection
 
 UNICYCLE = {
     "name": "unicycle",
@@ -174,3 +175,11 @@ def test_a_binding_reads_its_section_and_what_the_stage_itself_takes_beside_it()
 def test_an_error_of_the_constructor_names_the_section():
     with pytest.raises(ConfigError, match="Unicycle: control_lower needs 2 numbers, found 1"):
         build(UNICYCLE | {"control_lower": [-1]}, "dynamics")
+
+
+def test_options_that_a_section_inherits_are_checked_by_the_types_that_their_own_module_knows():
+    """The stage's module knows no ``Decay``: its name alone would be any type there."""
+    wrong = option_complaints(TrackerSection, {"steps": 2, "references": 1, "ema_decay": 2.0}, "tracker_training")
+    assert wrong == ["tracker_training.ema_decay must be a number in [0, 1) or null, found 2.0"]
+    wrong = option_complaints(TrackerSection, {"steps": 2, "references": 1, "warmup": 9}, "tracker_training")
+    assert wrong == ["tracker_training: steps must be positive and 0 <= warmup < steps, found 2 and 9"]

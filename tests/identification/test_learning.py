@@ -8,8 +8,9 @@ import torch
 
 from sagemp_cli.config.binding import build
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.identification import EnclosureWeight, Transitions, domain_of, learn_dynamics
+from sagemp_cli.identification import DynamicsTrainingOptions, EnclosureWeight, Transitions, domain_of, learn_dynamics
 from sagemp_cli.identification.enclosure_loss import enclosure_error
+from sagemp_cli.learning.checkpoint import Resumable
 
 SHORT = {"transitions": 2000, "held_out": 500, "steps": 150, "batch": 128, "learning_rate": 1e-2, "ema_decay": 0.9}
 
@@ -23,7 +24,9 @@ def robot(learned_unicycle):
 
 
 def learn(robot, seed=0, **options):
-    return learn_dynamics(robot, generator=torch.Generator().manual_seed(seed), **(SHORT | options))
+    about = {key: options.pop(key) for key in ("resumable", "progress") if key in options}
+    wanted = DynamicsTrainingOptions(**(SHORT | options))
+    return learn_dynamics(robot, wanted, generator=torch.Generator().manual_seed(seed), **about)
 
 
 def test_transitions_are_steps_of_the_model_from_its_whole_domain(robot):
@@ -89,8 +92,8 @@ def test_an_interrupted_run_resumes_in_the_same_bits(robot, tmp_path):
     learn(robot, **options)
     whole = [p.clone() for p in robot.parameters()]
     with pytest.raises(KeyboardInterrupt):
-        learn(robot, **options, checkpoint=tmp_path / "c.h5", progress=Stop(0))
-    learn(robot, **options, checkpoint=tmp_path / "c.h5")
+        learn(robot, **options, resumable=Resumable(tmp_path / "c.h5"), progress=Stop(0))
+    learn(robot, **options, resumable=Resumable(tmp_path / "c.h5"))
     assert all(torch.equal(a, b) for a, b in zip(whole, robot.parameters(), strict=True))
 
 

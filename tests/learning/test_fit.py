@@ -1,5 +1,6 @@
 """The training loop: what it learns, what it records, and that a resumed run is the same run."""
 
+import dataclasses
 import signal
 
 import numpy as np
@@ -8,7 +9,9 @@ import torch
 from torch import nn
 
 from sagemp_cli.errors import ArtifactError, ConfigError, NonFiniteError
-from sagemp_cli.learning.fit import FINAL_SHARE, fit, learning_rate_at
+from sagemp_cli.learning.checkpoint import Resumable
+from sagemp_cli.learning.fit import fit
+from sagemp_cli.learning.schedule import FINAL_SHARE, Schedule
 from sagemp_cli.progress import Silent
 
 TRUE = torch.tensor([[1.0, -2.0, 0.5]])
@@ -37,7 +40,8 @@ def error_of(module):
     return {"error": float((module.weight - TRUE).abs().max())}
 
 
-OPTIONS = dict(steps=40, learning_rate=0.05, ema_decay=0.9, weight_decay=0.01, validate=error_of, validate_every=7)
+SCHEDULE = Schedule(steps=40, learning_rate=0.05, ema_decay=0.9, weight_decay=0.01)
+OPTIONS = dict(validate=error_of, validate_every=7)
 
 
 def interrupted_at(step, kind=KeyboardInterrupt):
@@ -63,14 +67,14 @@ def assert_same(first, second):
 
 def test_a_linear_regression_finds_the_true_weights():
     module = line()
-    history = fit(module, regression, steps=400, learning_rate=0.05, generator=generator())
+    history = fit(module, regression, Schedule(steps=400, learning_rate=0.05), generator=generator())
     assert torch.allclose(module.weight, TRUE, atol=1e-3)
     assert history.loss.shape == (400,) and history.loss[-1] < 1e-4 * history.loss[0]
     assert not module.training
 
 
 def test_history_records_figures_and_validation():
-    history = fit(line(), regression, generator=generator(), **OPTIONS)
+    history = fit(line(), regression, SCHEDULE, generator=generator(), **OPTIONS)
     assert history.figures["every step"].tolist() == list(range(40))
     assert np.isnan(history.figures["late"][:5]).all() and (history.figures["late"][5:] == 1).all()
     assert history.validated_at.tolist() == [7, 14, 21, 28, 35, 40]
@@ -80,16 +84,16 @@ def test_history_records_figures_and_validation():
 @pytest.mark.parametrize("step", [0, 1, 7, 13, 39])
 def test_a_resumed_run_ends_in_the_same_bits(tmp_path, step):
     whole = line()
-    expected = fit(whole, regression, generator=generator(), **OPTIONS)
+    expected = fit(whole, regression, SCHEDULE, generator=generator(), **OPTIONS)
     path = tmp_path / "run.h5"
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), interrupted_at(step), generator=generator(), checkpoint=path, **OPTIONS)
+        fit(line(), interrupted_at(step), SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
     module, source = line(), generator()
-    history = fit(module, regression, generator=source, checkpoint=path, **OPTIONS)
+    history = fit(module, regression, SCHEDULE, generator=source, resumable=Resumable(path), **OPTIONS)
     assert_same((whole, expected), (module, history))
     reference = generator()
-    fit(line(), regression, generator=reference, **OPTIONS)
+    fit(line(), regression, SCHEDULE, generator=reference, **OPTIONS)
     assert torch.equal(source.get_state(), reference.get_state())
 
 
@@ -121,12 +125,19 @@ def test_an_interrupt_while_validating_is_resumed_exactly(tmp_path):
         return error_of(module)
 
     whole = line()
-    expected = fit(whole, regression, generator=generator(), **OPTIONS)
+    expected = fit(whole, regression, SCHEDULE, generator=generator(), **OPTIONS)
     path = tmp_path / "run.h5"
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), regression, generator=generator(), checkpoint=path, **(OPTIONS | {"validate": impatient}))
+        fit(
+            line(),
+            regression,
+            SCHEDULE,
+            generator=generator(),
+            resumable=Resumable(path),
+            **(OPTIONS | {"validate": impatient}),
+        )
     module = line()
-    history = fit(module, regression, generator=generator(), checkpoint=path, **OPTIONS)
+    history = fit(module, regression, SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)
     assert_same((whole, expected), (module, history))
 
 
@@ -142,18 +153,21 @@ def test_ctrl_c_in_the_middle_of_an_update_waits_for_its_end(tmp_path, monkeypat
 
     monkeypatch.setattr(torch.optim.AdamW, "step", pressed)
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), regression, generator=generator(), checkpoint=path, **OPTIONS)
+        fit(line(), regression, SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)
     monkeypatch.undo()
     whole, module = line(), line()
-    expected = fit(whole, regression, generator=generator(), **OPTIONS)
-    assert_same((whole, expected), (module, fit(module, regression, generator=generator(), checkpoint=path, **OPTIONS)))
+    expected = fit(whole, regression, SCHEDULE, generator=generator(), **OPTIONS)
+    assert_same(
+        (whole, expected),
+        (module, fit(module, regression, SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)),
+    )
 
 
 def test_a_crash_resumes_from_the_last_periodic_checkpoint(tmp_path):
     path = tmp_path / "run.h5"
-    options = OPTIONS | {"checkpoint": path, "checkpoint_every_seconds": 0.0}
+    options = OPTIONS | {"resumable": Resumable(path, every_seconds=0.0)}
     with pytest.raises(MemoryError):
-        fit(line(), interrupted_at(20, MemoryError), generator=generator(), **options)
+        fit(line(), interrupted_at(20, MemoryError), SCHEDULE, generator=generator(), **options)
     seen = []
 
     def watched(module, step, source):
@@ -161,27 +175,27 @@ def test_a_crash_resumes_from_the_last_periodic_checkpoint(tmp_path):
         return regression(module, step, source)
 
     whole, module = line(), line()
-    history = fit(module, watched, generator=generator(), **options)
+    history = fit(module, watched, SCHEDULE, generator=generator(), **options)
     assert seen[0] == 20
-    assert_same((whole, fit(whole, regression, generator=generator(), **OPTIONS)), (module, history))
+    assert_same((whole, fit(whole, regression, SCHEDULE, generator=generator(), **OPTIONS)), (module, history))
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     path = tmp_path / "run.h5"
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), interrupted_at(5), generator=generator(), checkpoint=path, identity="one", **OPTIONS)
-    for other in ({"identity": "two"}, {"identity": "one", "learning_rate": 0.04}):
+        fit(line(), interrupted_at(5), SCHEDULE, generator=generator(), resumable=Resumable(path, "one"), **OPTIONS)
+    for identity, schedule in (("two", SCHEDULE), ("one", dataclasses.replace(SCHEDULE, learning_rate=0.04))):
         with pytest.raises(ArtifactError, match=r"run\.h5 belongs to other work .* delete it to start over"):
-            fit(line(), regression, generator=generator(), checkpoint=path, **(OPTIONS | other))
+            fit(line(), regression, schedule, generator=generator(), resumable=Resumable(path, identity), **OPTIONS)
     with pytest.raises(ArtifactError, match=r"does not fit: module/weight has shape \(1, 3\), expected \(1, 2\)"):
-        fit(nn.Linear(2, 1), regression, generator=generator(), checkpoint=path, identity="one", **OPTIONS)
+        fit(nn.Linear(2, 1), regression, SCHEDULE, generator=generator(), resumable=Resumable(path, "one"), **OPTIONS)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path):
     path = tmp_path / "run.h5"
     path.write_bytes(b"\x89HDF\r\n\x1a\n and nothing more")
     with pytest.raises(ArtifactError, match=r"cannot read the checkpoint .*run\.h5 .* delete it to start over"):
-        fit(line(), regression, generator=generator(), checkpoint=path, **OPTIONS)
+        fit(line(), regression, SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)
 
 
 def test_the_moving_average_is_kept_and_validated():
@@ -192,14 +206,14 @@ def test_the_moving_average_is_kept_and_validated():
         return {}
 
     module = line()
-    options = dict(steps=200, learning_rate=0.02, schedule="constant", warmup=0, validate=remember, validate_every=1)
+    schedule = Schedule(steps=200, learning_rate=0.02, shape="constant", warmup=0, ema_decay=0.95)
     trace = []
 
     def noisy(subject, step, source):
         trace.append(subject.weight.detach().clone())
         return (subject.weight * torch.randn(1, 3, generator=source)).sum() + 0 * subject.bias.sum(), {}
 
-    fit(module, noisy, generator=generator(), ema_decay=0.95, **options)
+    fit(module, noisy, schedule, generator=generator(), validate=remember, validate_every=1)
     # Recompute the average from the trace of the weights: trace[i] is what update i - 1 left.
     mean = trace[0].clone()
     for i in range(1, 200):
@@ -221,10 +235,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(factor, what):
         fit(
             module,
             broken,
-            steps=9,
-            learning_rate=0.05,
+            Schedule(steps=9, learning_rate=0.05, shape="constant"),
             generator=generator(),
-            schedule="constant",
             description="the thing",
         )
     assert bool(torch.isfinite(module.weight).all())
@@ -237,7 +249,7 @@ def test_a_gradient_that_is_not_finite_stops_the_run():
         return torch.sqrt(subject.weight * 0.0).sum() + 0 * subject.bias.sum(), {}
 
     with pytest.raises(NonFiniteError, match="the gradient became nan in update 1"):
-        fit(module, kink, steps=9, learning_rate=0.05, generator=generator())
+        fit(module, kink, Schedule(steps=9, learning_rate=0.05), generator=generator())
     assert bool(torch.isfinite(module.weight).all())
 
 
@@ -255,15 +267,15 @@ def test_clipping_bounds_the_gradient():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.optim.AdamW, "step", step)
-        fit(module, steep, steps=5, learning_rate=0.01, generator=generator(), clip_norm=0.5)
-        fit(module, steep, steps=5, learning_rate=0.01, generator=generator(), clip_norm=None)
+        for clip_norm in (0.5, None):
+            fit(module, steep, Schedule(steps=5, learning_rate=0.01, clip_norm=clip_norm), generator=generator())
     assert max(norms[:5]) <= 0.5 + 1e-5
     assert min(norms[5:]) > 1e3
 
 
 def test_the_learning_rate_warms_up_and_falls():
-    def at(step, schedule="cosine"):
-        return learning_rate_at(step, steps=101, peak=2.0, warmup=10, schedule=schedule)
+    def at(step, shape="cosine"):
+        return Schedule(steps=101, learning_rate=2.0, warmup=10, shape=shape).rate_at(step)
 
     assert at(0) == pytest.approx(2 / 11)
     assert at(10) == pytest.approx(2.0)
@@ -276,15 +288,20 @@ def test_the_learning_rate_warms_up_and_falls():
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"schedule": "cosin"}, r"training: schedule must be one of \('cosine', 'constant'\), found 'cosin'"),
-        ({"steps": 0}, "training: steps and validate_every must be positive"),
-        ({"learning_rate": -1.0}, "training: learning_rate must be a positive number, found -1.0"),
-        ({"ema_decay": 1.0}, r"training: ema_decay must lie in \[0, 1\), found 1.0"),
+        ({"shape": "cosin"}, "shape must be 'cosine' or 'constant', found 'cosin'"),
+        ({"steps": 0}, "steps must be positive and 0 <= warmup < steps, found 0 and 0"),
+        ({"learning_rate": -1.0}, "learning_rate must be a positive number, found -1.0"),
+        ({"ema_decay": 1.0}, r"ema_decay must lie in \[0, 1\), found 1.0"),
     ],
 )
 def test_wrong_options_are_named(wrong, text):
     with pytest.raises(ConfigError, match=text):
-        fit(line(), regression, generator=generator(), **({"steps": 9, "learning_rate": 0.1} | wrong))
+        Schedule(**({"steps": 9, "learning_rate": 0.1} | wrong))
+
+
+def test_a_validation_every_zeroth_update_is_refused():
+    with pytest.raises(ConfigError, match="training: validate_every must be positive, found 0"):
+        fit(line(), regression, SCHEDULE, generator=generator(), validate_every=0)
 
 
 def test_progress_counts_every_update_once_even_when_resumed(tmp_path):
@@ -311,8 +328,8 @@ def test_progress_counts_every_update_once_even_when_resumed(tmp_path):
 
     path = tmp_path / "run.h5"
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), interrupted_at(9), generator=generator(), checkpoint=path, **OPTIONS)
+        fit(line(), interrupted_at(9), SCHEDULE, generator=generator(), resumable=Resumable(path), **OPTIONS)
     progress = Counting()
-    fit(line(), regression, generator=generator(), checkpoint=path, progress=progress, **OPTIONS)
+    fit(line(), regression, SCHEDULE, generator=generator(), resumable=Resumable(path), progress=progress, **OPTIONS)
     assert (progress.description, progress.total, progress.done) == ("training", 40, 40)
     assert progress.last.startswith("loss ") and "error " in progress.last

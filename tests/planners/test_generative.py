@@ -6,9 +6,12 @@ import math
 import pytest
 import torch
 
+from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import ConfigError, NonFiniteError, UsageError
-from sagemp_cli.planners import Diffusion, FlowMatching, Planner, Proposer, train_planner
+from sagemp_cli.learning.checkpoint import Resumable
+from sagemp_cli.planners import Diffusion, FlowMatching, Planner, PlannerTrainingOptions, Proposer, train_planner
 from sagemp_cli.planners.generative import FADE
+from sagemp_cli.problem import Problem
 from sagemp_cli.sets import Box
 
 KINDS = {
@@ -115,9 +118,17 @@ def test_wrong_starts_are_named(made, scene):
         sample(made, torch.zeros(2, 4), scene, 3)
 
 
+def problem_in(scene):
+    limits = {"control_lower": [-9.0] * 2, "control_upper": [9.0] * 2}
+    robot = Unicycle(dt=0.1, state_lower=[-9.0] * 4, state_upper=[9.0] * 4, **limits)
+    return Problem(robot, scene, Box.around([0.0] * 4, [0.1] * 4), Box.around([0.0] * 4, [0.0] * 4), HORIZON)
+
+
 def train(made, demonstrations, held_out, scene, **changes):
-    options = {"steps": 8, "generator": torch.Generator().manual_seed(0), "position": POSITION} | changes
-    return train_planner(made, demonstrations, held_out=held_out, scene=scene, **options)
+    about = {"generator": torch.Generator().manual_seed(0), "resumable": changes.pop("resumable", None)}
+    options = PlannerTrainingOptions(**({"steps": 8} | changes))
+    problem = problem_in(scene)
+    return train_planner(made, demonstrations, held_out=held_out, problem=problem, options=options, **about)
 
 
 def test_an_interrupted_training_resumes_to_the_same_planner(name, demonstrations, held_out, scene, tmp_path):
@@ -136,8 +147,8 @@ def test_an_interrupted_training_resumes_to_the_same_planner(name, demonstration
 
     checkpoint = tmp_path / "planner.h5"
     with pytest.raises(KeyboardInterrupt):
-        train(Impatient(**resumed.arguments), demonstrations, held_out, scene, checkpoint=checkpoint)
-    train(resumed, demonstrations, held_out, scene, checkpoint=checkpoint)
+        train(Impatient(**resumed.arguments), demonstrations, held_out, scene, resumable=Resumable(checkpoint))
+    train(resumed, demonstrations, held_out, scene, resumable=Resumable(checkpoint))
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
 

@@ -3,9 +3,13 @@
 import pytest
 import torch
 
+from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import ConfigError, NonFiniteError, UsageError
-from sagemp_cli.planners import NeuralODE, train_planner
+from sagemp_cli.learning.checkpoint import Resumable
+from sagemp_cli.planners import NeuralODE, PlannerTrainingOptions, train_planner
 from sagemp_cli.planners.neural_ode import NeuralODELoss
+from sagemp_cli.problem import Problem
+from sagemp_cli.sets import Box
 
 POSITION, HORIZON = (0, 1), 40
 
@@ -14,9 +18,17 @@ def planner():
     return NeuralODE(state_dim=4, horizon=HORIZON, dt=0.1, hidden=[32, 32])
 
 
+def problem_in(scene):
+    limits = {"control_lower": [-9.0] * 2, "control_upper": [9.0] * 2}
+    robot = Unicycle(dt=0.1, state_lower=[-9.0] * 4, state_upper=[9.0] * 4, **limits)
+    return Problem(robot, scene, Box.around([0.0] * 4, [0.1] * 4), Box.around([0.0] * 4, [0.0] * 4), HORIZON)
+
+
 def train(made, demonstrations, held_out, scene, **changes):
-    options = {"steps": 400, "generator": torch.Generator().manual_seed(0), "position": POSITION} | changes
-    return train_planner(made, demonstrations, held_out=held_out, scene=scene, **options)
+    about = {"generator": torch.Generator().manual_seed(0), "resumable": changes.pop("resumable", None)}
+    options = PlannerTrainingOptions(**({"steps": 400} | changes))
+    problem = problem_in(scene)
+    return train_planner(made, demonstrations, held_out=held_out, problem=problem, options=options, **about)
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +93,8 @@ def test_an_interrupted_training_resumes_to_the_same_planner(demonstrations, hel
 
     with pytest.raises(KeyboardInterrupt):
         half = Impatient(**resumed.arguments)
-        train(half, demonstrations, held_out, scene, steps=12, checkpoint=tmp_path / "planner.h5")
-    train(resumed, demonstrations, held_out, scene, steps=12, checkpoint=tmp_path / "planner.h5")
+        train(half, demonstrations, held_out, scene, steps=12, resumable=Resumable(tmp_path / "planner.h5"))
+    train(resumed, demonstrations, held_out, scene, steps=12, resumable=Resumable(tmp_path / "planner.h5"))
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
 

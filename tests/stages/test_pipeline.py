@@ -134,7 +134,7 @@ def test_an_input_of_another_config_is_refused(work):
         (
             "train-planner",
             "+planner_training.stepz=1",
-            r"planner_training.stepz: train_planner has no such option \(did you mean 'steps'",
+            r"planner_training.stepz: no such option \(did you mean 'steps'",
         ),
         (
             "train-planner",
@@ -147,7 +147,7 @@ def test_an_input_of_another_config_is_refused(work):
             "tracker_training.references=0",
             "tracker_training.references must be a whole",
         ),
-        ("train-tracker", "+tracker_training.lr=1", "tracker_training.lr: train_tracker has no such option"),
+        ("train-tracker", "+tracker_training.lr=1", "tracker_training.lr: no such option"),
         ("verify", "proof.partitions=0", "partitions must be a positive number of cells in all"),
         ("verify", "verify.references=0", "verify.references must be a whole number"),
         ("verify", "+verify.falsifier.steps=3", r"verify.falsifier.steps: no such option"),

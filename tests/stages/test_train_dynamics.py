@@ -101,7 +101,7 @@ def test_a_robot_of_formulas_has_nothing_to_learn(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("+dynamics_training.stepz=3", "dynamics_training.stepz: learn_dynamics has no such option"),
+        ("+dynamics_training.stepz=3", "dynamics_training.stepz: no such option"),
         ("+dynamics_training.enclosure.wait=3", "dynamics_training.enclosure.wait: EnclosureWeight has no such option"),
         ("+verify.true_modell=3", "verify.true_modell: no such option"),
         ("dynamics.inputs=[thta]", "dynamics.inputs: there is no state 'thta'"),

@@ -1,5 +1,7 @@
 """``train-planner`` for planners that learn from demonstrations, from scenes, or not at all."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -115,19 +117,27 @@ def test_a_file_that_is_missing_is_one_line(tmp_path):
         stage_named("train-planner").run(context_of(tmp_path, "from_file"))
 
 
+@dataclasses.dataclass(frozen=True)
+class RoundOptions:
+    """What the planner below takes from ``planner_training``."""
+
+    rounds: int = 2
+
+
 @pytest.fixture
 def self_taught(monkeypatch):
     """The neural ODE as if it taught itself."""
     calls = []
 
-    def learn(self, *, scene, generator, checkpoint, identity, progress, rounds: int = 2):
-        calls.append((rounds, checkpoint.name, len(identity)))
+    def learn(self, options, *, scene, generator, resumable, progress):
+        calls.append((options.rounds, resumable.path.name, len(resumable.identity)))
         self.field.reset(generator)
         empty = np.zeros(0, dtype=np.int64)
-        return History(loss=np.linspace(1, 0.5, rounds), figures={}, validated_at=empty, validation={})
+        return History(loss=np.linspace(1, 0.5, options.rounds), figures={}, validated_at=empty, validation={})
 
     monkeypatch.setattr(NeuralODE, "learns_from", "scenes")
     monkeypatch.setattr(NeuralODE, "learn", learn, raising=False)
+    monkeypatch.setattr(NeuralODE, "options_type", RoundOptions, raising=False)
     return calls
 
 
@@ -155,9 +165,9 @@ def test_a_planner_whose_plans_are_dear_is_asked_for_as_few_as_it_says(tmp_path,
 
 def test_options_of_a_planner_that_teaches_itself_are_those_of_its_own(tmp_path, self_taught):
     context = context_of(tmp_path, "neural_ode", drop=(), training={"round": 4})
-    with pytest.raises(ConfigError, match=r"round: learn has no such option \(did you mean 'rounds'\?"):
+    with pytest.raises(ConfigError, match=r"round: no such option \(did you mean 'rounds'\?"):
         require_sound_config(context.config)
-    with pytest.raises(ConfigError, match="planner_training.round: learn has no such option"):
+    with pytest.raises(ConfigError, match="planner_training.round: no such option"):
         stage_named("train-planner").run(context)
 
 

@@ -8,11 +8,19 @@ import pytest
 import torch
 
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Silent
+from sagemp_cli.scenes import Scene
 from sagemp_cli.sets import Box
-from sagemp_cli.trackers.training import RolloutSampler, train_tracker
+from sagemp_cli.trackers.training import RolloutSampler, TrackerTrainingOptions, train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
+
+
+def problem_of(robot, start, disturbance):
+    scene = Scene(Box([-9.0] * 2, [9.0] * 2), (), Box([-9.0] * 4, [9.0] * 4))
+    return Problem(robot, scene, start, disturbance, 12)
 
 
 def draw(references, start, disturbance, *, count=64, length=8, seed=0):
@@ -80,14 +88,11 @@ def test_the_target_of_a_step_is_the_reference_after_it(unicycle, disturbance, m
             parameter.zero_()  # no control, whatever the errors
     history = train_tracker(
         tracker,
-        robot,
+        problem_of(robot, Box.around(still, [0.0] * 4), Box.around([0.0] * 4, [0.0] * 4)),
+        # Longer rollouts, begun late, would run on where the reference stands.
+        TrackerTrainingOptions(steps=1, batch=8, rollout_steps=1),
         references=torch.stack(states).expand(2, 13, 4),
-        start=Box.around(still, [0.0] * 4),
-        disturbance=Box.around([0.0] * 4, [0.0] * 4),
         generator=torch.Generator().manual_seed(0),
-        steps=1,
-        batch=8,
-        rollout_steps=1,  # longer ones, begun late, would run on where the reference stands
     )
     assert history.figures["track"][0] < 1e-15
 
@@ -104,15 +109,10 @@ def test_plain_training_lowers_the_loss_and_the_tracking_error(unicycle, referen
     before = tracking_error(tracker, unicycle, references, start)
     history = train_tracker(
         tracker,
-        unicycle,
+        problem_of(unicycle, start, disturbance),
+        TrackerTrainingOptions(steps=50, batch=16, rollout_steps=12, learning_rate=0.03),
         references=references,
-        start=start,
-        disturbance=disturbance,
         generator=torch.Generator().manual_seed(0),
-        steps=50,
-        batch=16,
-        rollout_steps=12,
-        learning_rate=0.03,
     )
     assert set(history.figures) == {"track", "state", "control"}
     assert history.figures["track"][-10:].mean() < 0.6 * history.figures["track"][:5].mean()
@@ -132,22 +132,19 @@ class _Interrupt(Silent):
 
 
 def test_an_interrupted_run_ends_in_the_same_bits(unicycle, references, start, disturbance, make_tracker, tmp_path):
-    def run(checkpoint=None, progress=None):
+    tube = TubeLoss(references=1, counts=[1, 1], steps=4)
+    options = TrackerTrainingOptions(steps=4, batch=4, rollout_steps=6, tube=tube, tube_steps=3)
+
+    def run(resumable=None, progress=None):
         tracker = make_tracker()
         try:
             train_tracker(
                 tracker,
-                unicycle,
+                problem_of(unicycle, start, disturbance),
+                options,
                 references=references,
-                start=start,
-                disturbance=disturbance,
                 generator=torch.Generator().manual_seed(0),
-                steps=4,
-                batch=4,
-                rollout_steps=6,
-                tube=TubeLoss(references=1, counts=[1, 1], steps=4),
-                tube_steps=3,
-                checkpoint=checkpoint,
+                resumable=resumable,
                 progress=progress,
             )
         except KeyboardInterrupt:
@@ -155,7 +152,7 @@ def test_an_interrupted_run_ends_in_the_same_bits(unicycle, references, start, d
         return tracker.state_dict()
 
     whole = run()
-    checkpoint = tmp_path / "run.npz"
+    checkpoint = Resumable(tmp_path / "run.npz")
     assert run(checkpoint, _Interrupt("training the tracker on its tubes")) is None
     resumed = run(checkpoint)
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
@@ -165,12 +162,10 @@ def test_rollouts_longer_than_the_reference_are_refused(unicycle, references, st
     with pytest.raises(ConfigError, match=re.escape("tracker_training.rollout_steps must lie in 1..12, found 40")):
         train_tracker(
             make_tracker(),
-            unicycle,
+            problem_of(unicycle, start, disturbance),
+            TrackerTrainingOptions(steps=1),
             references=references,
-            start=start,
-            disturbance=disturbance,
             generator=torch.Generator(),
-            steps=1,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
@@ -9,18 +10,24 @@ import torch
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
+from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.trackers.training import train_tracker
+from sagemp_cli.scenes import Scene
+from sagemp_cli.sets import Box
+from sagemp_cli.trackers.training import TrackerTrainingOptions, train_tracker
 from sagemp_cli.trackers.tube_loss import TubeLoss
+
+
+def problem_of(robot, start, disturbance):
+    scene = Scene(Box([-9.0] * 2, [9.0] * 2), (), Box([-9.0] * 4, [9.0] * 4))
+    return Problem(robot, scene, start, disturbance, 12)
 
 
 def loss_of(loss, tracker, unicycle, references, start, disturbance, *, share=1.0, seed=0):
     return loss(
         tracker,
-        unicycle,
+        problem_of(unicycle, start, disturbance),
         references=references,
-        start=start,
-        disturbance=disturbance,
         share=share,
         generator=torch.Generator().manual_seed(seed),
     )
@@ -75,19 +82,13 @@ def test_the_gradient_agrees_with_finite_differences(unicycle, references, start
 
 
 def test_training_with_it_narrows_the_tube(unicycle, references, start, disturbance, make_tracker):
-    common = dict(
-        learning_rate=0.03,
-        references=references,
-        start=start,
-        disturbance=disturbance,
-        steps=20,
-        batch=8,
-        rollout_steps=12,
-    )
+    plain = TrackerTrainingOptions(learning_rate=0.03, steps=20, batch=8, rollout_steps=12, tube_steps=20)
+    problem = problem_of(unicycle, start, disturbance)
     widths = []
     for tube in (None, TubeLoss(weight=1.0, references=2, counts=[1, 1], steps=12, shrink=1.0)):
         tracker = make_tracker()
-        train_tracker(tracker, unicycle, generator=torch.Generator().manual_seed(0), tube=tube, tube_steps=20, **common)
+        options, generator = dataclasses.replace(plain, tube=tube), torch.Generator().manual_seed(0)
+        train_tracker(tracker, problem, options, references=references, generator=generator)
         tube_ = Affine().propagate(ClosedLoop(unicycle, tracker, references[0]), start, disturbance)
         widths.append(tube_.width[-1].mean().item())
     assert widths[1] < 0.9 * widths[0]

@@ -5,17 +5,20 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sagemp_cli.config.binding import options_for
+from sagemp_cli.config.ranges import Count, Decay, Positive
 from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.learning.fit import History, fit
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.vlm.answer import MOST_WAYPOINTS, AnswerError, waypoints_of
 from sagemp_cli.planners.vlm.lessons import Lessons, answer_figures
@@ -37,6 +40,33 @@ SERVICE_PLANS = 4
 """Plans that are asked of a service for model cards and figures, where others give hundreds."""
 _SHOWN = 32
 """Starts from which the stand-in is tried in the experiment's own scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PracticeOptions(Schedule):
+    """How the stand-in learns.
+
+    Attributes:
+        exercises: random scenes to learn from.
+        held_out: random scenes for the figures.
+        batch: scenes per update.
+        margin: distance to obstacles that is learned, as a share of half the picture.
+    """
+
+    learning_rate: Positive = 3e-3
+    ema_decay: Decay | None = 0.99
+    exercises: Count = 2000
+    held_out: Count = 100
+    batch: Count = 32
+    margin: Decay = 0.08
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.exercises, self.held_out, self.batch) < 1 or not 0 <= self.margin < 1:
+            raise ConfigError(
+                "planner_training: exercises, held_out and batch must be positive and margin in [0, 1), "
+                f"found {self.exercises}, {self.held_out}, {self.batch} and {self.margin}"
+            )
 
 
 class Provider(Protocol):
@@ -79,6 +109,7 @@ class VLM(nn.Module):
         recording: file of recorded answers, or a folder of them, such as a service's cache.
     """
 
+    options_type: ClassVar = PracticeOptions
     learns_from: str = "scenes"
     """What training needs; of an instance with another provider than ``local`` it is "nothing"."""
 
@@ -214,18 +245,11 @@ class VLM(nn.Module):
 
     def learn(
         self,
+        options: PracticeOptions,
         *,
         scene: Scene,
         generator: torch.Generator,
-        steps: int,
-        exercises: int = 2000,
-        held_out: int = 100,
-        batch: int = 32,
-        margin: float = 0.08,
-        learning_rate: float = 3e-3,
-        ema_decay: float | None = 0.99,
-        checkpoint: Path | None = None,
-        identity: str = "",
+        resumable: Resumable | None = None,
         progress: Progress | None = None,
     ) -> History:
         """Train the stand-in on random scenes; see :func:`~sagemp_cli.planners.vlm.practice.random_exercise`.
@@ -235,33 +259,20 @@ class VLM(nn.Module):
         on its left.
 
         Args:
+            options: what is learned from, and how long.
             scene: the scene to report on; nothing is learned from it.
             generator: source of all randomness.
-            steps: number of updates.
-            exercises: random scenes to learn from.
-            held_out: random scenes for the figures.
-            batch: scenes per update.
-            margin: distance to obstacles that is learned, as a share of half the picture.
-            learning_rate: see :func:`sagemp_cli.learning.fit.fit`.
-            ema_decay: see there.
-            checkpoint: see there.
-            identity: see there.
-            progress: where the course is shown.
+            resumable, progress: see :func:`sagemp_cli.learning.fit.fit`.
 
         Raises:
             UsageError: the provider is not ``local``: there is nothing to train.
         """
         if self.reader is None:
             raise UsageError(f"planner.provider '{self.provider_name}' has nothing to train; only 'local' learns")
-        if min(exercises, held_out, batch) < 1 or not 0 <= margin < 1:
-            raise ConfigError(
-                "planner_training: exercises, held_out and batch must be positive and margin in [0, 1), "
-                f"found {exercises}, {held_out}, {batch} and {margin}"
-            )
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
-        kept_back = [random_exercise(rng) for _ in range(held_out)]
+        kept_back = [random_exercise(rng) for _ in range(options.held_out)]
         practice = practice_of(
-            [random_exercise(rng) for _ in range(exercises)], pixels=self.reader.pixels, margin=margin
+            [random_exercise(rng) for _ in range(options.exercises)], pixels=self.reader.pixels, margin=options.margin
         )
         seed = int(torch.randint(2**62, (), generator=generator))
         self.reader.reset(generator)
@@ -275,15 +286,12 @@ class VLM(nn.Module):
 
         return fit(
             self.reader,
-            Lessons(practice, batch),
-            steps=steps,
-            learning_rate=learning_rate,
-            ema_decay=ema_decay,
+            Lessons(practice, options.batch),
+            options,
             generator=generator,
             validate=validate,
-            validate_every=math.ceil(steps / 5),
-            checkpoint=checkpoint,
-            identity=identity,
+            validate_every=math.ceil(options.steps / 5),
+            resumable=resumable,
             progress=progress,
             description="training the stand-in for a VLM",
         )

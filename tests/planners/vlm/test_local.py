@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sagemp_cli.learning.fit import fit
+from sagemp_cli.learning.schedule import Schedule
 from sagemp_cli.planners.vlm.lessons import Lessons, along, answers_to
 from sagemp_cli.planners.vlm.network import SceneReader, cell_middles
 from sagemp_cli.planners.vlm.practice import SQUARE, Exercise, practice_of, random_exercise
@@ -110,7 +111,7 @@ def test_practice_lowers_the_loss():
     practice = practice_of([random_exercise(rng) for _ in range(32)], pixels=32, margin=0.1)
     reader = SceneReader(pixels=32, channels=8)
     reader.reset(generator)
-    history = fit(reader, Lessons(practice, 8), steps=24, learning_rate=1e-2, generator=generator)
+    history = fit(reader, Lessons(practice, 8), Schedule(steps=24, learning_rate=1e-2), generator=generator)
     assert history.loss[-4:].mean() < 0.7 * history.loss[:2].mean()
     assert set(history.figures) == {"avoid", "pass over", "naming"}
 

@@ -14,11 +14,12 @@ from sagemp_cli.config.binding import build
 from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM
+from sagemp_cli.planners.vlm.planner import PracticeOptions
 from sagemp_cli.sets import Box
 
 START = torch.tensor([-1.5, -0.2, 0.0], dtype=torch.float64)
 SIZES = {"state_dim": 3, "horizon": 30, "dt": 0.3}
-TOY = {"steps": 6, "exercises": 24, "held_out": 8, "batch": 8}
+TOY = PracticeOptions(steps=6, exercises=24, held_out=8, batch=8)
 
 
 def draw(planner, scene, count=3, *, seed=0, start=START):
@@ -128,13 +129,13 @@ def test_a_service_has_nothing_to_learn(table):
     planner = VLM(**SIZES, provider="openai")
     assert planner.learns_from == "nothing" and not list(planner.state_dict()) and planner.affordable_plans == 4
     with pytest.raises(UsageError, match="provider 'openai' has nothing to train; only 'local' learns"):
-        planner.learn(scene=table, generator=torch.Generator(), **TOY)
+        planner.learn(TOY, scene=table, generator=torch.Generator())
 
 
 @pytest.fixture(scope="module")
 def taught(table):
     planner = VLM(**SIZES, network={"pixels": 32, "channels": 8})
-    history = planner.learn(scene=table, generator=torch.Generator().manual_seed(0), **TOY)
+    history = planner.learn(TOY, scene=table, generator=torch.Generator().manual_seed(0))
     return planner, history
 
 
@@ -154,7 +155,7 @@ def test_the_stand_in_says_that_it_is_one(taught):
 def test_learning_again_with_the_same_seed_gives_the_same_bits(taught, table):
     planner, history = taught
     again = VLM(**SIZES, network={"pixels": 32, "channels": 8})
-    other = again.learn(scene=table, generator=torch.Generator().manual_seed(0), **TOY)
+    other = again.learn(TOY, scene=table, generator=torch.Generator().manual_seed(0))
     np.testing.assert_array_equal(history.loss, other.loss)
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in planner.state_dict().items())
 

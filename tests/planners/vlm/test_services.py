@@ -337,7 +337,7 @@ def test_a_damaged_cache_entry_is_named(ask, tmp_path):
         ({"base_url": "http://"}, "planner.service.base_url must begin with http:// or https://"),
         ({"timeout": 0.0}, "timeout and time_limit must be positive seconds"),
         ({"retries": -1}, "retries and temperature must not be negative"),
-        ({"modle": "x"}, "planner.service.modle: ServiceOptions has no such option (did you mean 'model'?)"),
+        ({"modle": "x"}, "planner.service.modle: no such option (did you mean 'model'?)"),
     ],
 )
 def test_wrong_options_of_a_service_are_named(service, message):
