@@ -28,6 +28,10 @@ def assert_same(a: Any, b: Any) -> None:
         assert a.keys() == b.keys()
         for key in a:
             assert_same(a[key], b[key])
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other)
     elif isinstance(a, np.ndarray):
         np.testing.assert_array_equal(a, b)
     else:
