@@ -107,10 +107,10 @@ class Listener(Silent):
 
 def test_a_resumed_run_says_where_it_goes_on(tmp_path):
     path, fresh, resumed = tmp_path / "run.h5", Listener(), Listener()
-    options = OPTIONS | {"checkpoint": path, "description": "training it"}
+    options = OPTIONS | {"resumable": Resumable(path), "description": "training it"}
     with pytest.raises(KeyboardInterrupt):
-        fit(line(), interrupted_at(23), generator=generator(), progress=fresh, **options)
-    fit(line(), regression, generator=generator(), progress=resumed, **options)
+        fit(line(), interrupted_at(23), SCHEDULE, generator=generator(), progress=fresh, **options)
+    fit(line(), regression, SCHEDULE, generator=generator(), progress=resumed, **options)
     assert fresh.said == []
     assert resumed.said == ["training it: goes on from update 23 of 40"]
 
