@@ -178,12 +178,11 @@ def test_before_the_loss_rises_with_the_tube_in_it_it_is_said_why(
         def say(self, text):
             self.said.append(text)
 
-    common = {"references": references, "start": start, "disturbance": disturbance, "steps": 1, "rollout_steps": 4}
+    problem = problem_of(unicycle, start, disturbance)
     for tube in (None, TubeLoss(references=1, counts=[1, 1], steps=3, shrink=0.25)):
         generator, progress = torch.Generator().manual_seed(0), Listener()
         progress.said = []
-        train_tracker(
-            make_tracker(), unicycle, generator=generator, tube=tube, tube_steps=1, progress=progress, **common
-        )
+        options = TrackerTrainingOptions(steps=1, rollout_steps=4, tube=tube, tube_steps=1)
+        train_tracker(make_tracker(), problem, options, references=references, generator=generator, progress=progress)
         why = "the tube's width joins the loss, with sets that grow from 25% of their size to all of it"
         assert [text[: len(why)] for text in progress.said] == ([] if tube is None else [why])
