@@ -104,10 +104,11 @@ def _line(f: Finding, what: str, *, falsified: bool = False) -> str:
     if not f.proved:
         verb = "NOT PROVED" if f.claimed == "SAFE" else f.claimed
         return f"  {what} {f.reference}: {verb}: {f.reason}"
-    near = min(f.clearance, key=f.clearance.__getitem__)
+    near = min(f.clearance, key=f.clearance.__getitem__, default=None)
+    clear = "" if near is None else f", keeps {f.clearance[near]:.3g} m from {near}"
     goal = min(f.goal_margin, key=f.goal_margin.__getitem__, default=None)
     inside = f", ends {f.goal_margin[goal]:.3g} inside the goal ({goal})" if goal else ""
-    return f"  {what} {f.reference}: proved, keeps {f.clearance[near]:.3g} m from {near}{inside}"
+    return f"  {what} {f.reference}: proved{clear}{inside}"
 
 
 _TITLES = {

@@ -164,7 +164,7 @@ def _search_project_first() -> None:
 
 def _experiment(path: str) -> dict[str, Any]:
     """The content of an experiment's file."""
-    data = _mapping_in(Path(path), f"experiment file {path}")
+    data = mapping_in(Path(path), f"experiment file {path}")
     return {"name": Path(path).stem} | data
 
 
@@ -204,7 +204,7 @@ def _experiments(name: str) -> list[tuple[Mapping[str, Any], dict[str, str]]]:
     path = Path(name) if _is_file(name) else config_file("experiment", name)
     if path is None or not path.is_file():
         return [({}, {})]
-    body, chain, choices = _mapping_in(path, f"experiment file {path}"), [], {}
+    body, chain, choices = mapping_in(path, f"experiment file {path}"), [], {}
     for default in body.get("defaults") or []:
         if isinstance(default, str) and default != "_self_":
             chain += _experiments(default)
@@ -351,18 +351,26 @@ def load_scene(scene: Any) -> Any:
     if "/" in scene or scene.endswith((".yaml", ".yml")):
         if not is_there(Path(scene)):
             raise ConfigError(f"scene '{scene}': no such file (looked for {Path(scene).resolve()})")
-        return _mapping_in(Path(scene), f"scene file {scene}")
+        return mapping_in(Path(scene), f"scene file {scene}")
     known = sorted(p.stem for p in folder.glob("*.yaml"))
     if scene not in known:
         raise ConfigError(
             f"scene '{scene}': no such scene{did_you_mean(scene, known)}; known: {', '.join(known)}; "
             f"one of your own is given as a file, scene=path/to/file.yaml"
         )
-    return _mapping_in(folder / f"{scene}.yaml", f"scene file {scene}")
+    return mapping_in(folder / f"{scene}.yaml", f"scene file {scene}")
 
 
-def _mapping_in(path: Path, what: str) -> dict[str, Any]:
-    """The mapping in a YAML file."""
+def mapping_in(path: Path, what: str) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    Args:
+        path: the file.
+        what: what it is, for messages.
+
+    Raises:
+        ConfigError: it is missing, too large, or not plain YAML with a mapping in it.
+    """
     try:
         if require_regular(path, "a file in YAML") > _LARGEST_YAML:
             raise ConfigError(f"{what}: is larger than {_LARGEST_YAML} bytes")

@@ -96,10 +96,11 @@ def tracker_of(section: Mapping[str, Any], dynamics: Dynamics, horizon: int) -> 
     extra = data_arguments(section, "tracker", dynamics, horizon)
     kind = target_class(section, "tracker")
     given = {key: value for key, value in section.items() if key != NAME}
-    if getattr(kind, "trains", True):
+    taken = None if getattr(kind, "trains", True) else getattr(kind, "taken", None)
+    if taken is None:
         made = build(section, "tracker", **extra)
     else:
-        made = kind.taken(**options_for(kind, given, "tracker", given=tuple(extra)), **extra)
+        made = taken(**options_for(kind, given, "tracker", given=tuple(extra)), **extra)
     if not isinstance(made, Controller):
         raise ConfigError(
             f"tracker '{section[NAME]}' is no Controller (see docs/adding.md), found {type(made).__name__}"

@@ -12,8 +12,9 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from sagemp_cli.errors import ConfigError, SagempError
+from sagemp_cli.errors import ConfigError, SagempError, did_you_mean
 
 
 def load(plugin: str, *, folder: Path | None = None) -> None:
@@ -59,6 +60,29 @@ def load_all(plugins: Sequence[str], *, folder: Path | None = None) -> None:
     """Import several; see :func:`load`."""
     for plugin in plugins:
         load(plugin, folder=folder)
+
+
+def load_object(target: str) -> tuple[Any, str]:
+    """What a Python file defines, and a name for it.
+
+    Args:
+        target: ``path/to/file.py:name``, named by the person at the keyboard; it is imported like a plugin.
+
+    Returns:
+        The object, and ``file_name``.
+
+    Raises:
+        ConfigError: it names no file, the file fails, or it defines no such name.
+    """
+    file, colon, name = target.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise ConfigError(f"{target}: must be a Python file and a name in it, such as my_loop.py:step")
+    load(file)
+    module = sys.modules[Path(file).stem]
+    if not hasattr(module, name):
+        known = [n for n, value in vars(module).items() if callable(value) and not n.startswith("_")]
+        raise ConfigError(f"{file}: defines no '{name}'{did_you_mean(name, known)}")
+    return getattr(module, name), f"{Path(file).stem}_{name}"
 
 
 def _where(error: Exception, origin: str | None) -> str:

@@ -125,13 +125,14 @@ def check_box(name: str, box: Any) -> None:
 
 def _function(step: Any, n: int, horizon: Any) -> tuple[Callable[[int, Any, Any], Any], int, bool]:
     """``(k, x, w) -> x_next``, the number of steps, and whether steps differ."""
+    loop: Any = step  # a checker of types takes what has been called callable for a function
     is_loop = not callable(step) and callable(getattr(step, "step", None))
     if not is_loop and not callable(step):
         raise UsageError(
             f"step must be a function step(x, w) or a loop with step(k, x, w), found {type(step).__name__}"
         )
     if is_loop and horizon is None:
-        horizon = step.horizon
+        horizon = loop.horizon
     try:
         steps = operator.index(horizon)
     except TypeError:
@@ -142,11 +143,11 @@ def _function(step: Any, n: int, horizon: Any) -> tuple[Callable[[int, Any, Any]
         return step, steps, True
     if not is_loop:
         return lambda k, x, w: step(x, w), steps, False
-    if step.state_dim != n:
-        raise UsageError(f"the loop has {step.state_dim} states, the start box has {n}")
-    if steps > step.horizon:
-        raise UsageError(f"horizon {steps} is longer than the loop's, {step.horizon}")
-    return step.step, steps, True
+    if loop.state_dim != n:
+        raise UsageError(f"the loop has {loop.state_dim} states, the start box has {n}")
+    if steps > loop.horizon:
+        raise UsageError(f"horizon {steps} is longer than the loop's, {loop.horizon}")
+    return loop.step, steps, True
 
 
 def _simulated(step: Step, start: Box, disturbance: Box, steps: int) -> tuple[Tensor, Tensor]:

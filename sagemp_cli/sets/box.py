@@ -58,6 +58,11 @@ class Box:
         return self.lower.shape[-1]
 
     @property
+    def has_faces(self) -> bool:
+        """Whether it ends anywhere: whether a side of it is finite."""
+        return bool((torch.isfinite(self.lower) | torch.isfinite(self.upper)).any())
+
+    @property
     def center(self) -> Tensor:
         """A point of the box near its middle, ``(..., n)``."""
         return torch.minimum(torch.maximum(0.5 * self.lower + 0.5 * self.upper, self.lower), self.upper)

@@ -11,7 +11,7 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -53,13 +53,12 @@ class LoopClaim:
     @property
     def bounds_the_position(self) -> bool:
         """Whether there is a workspace."""
-        workspace = self.scene.workspace
-        return bool((torch.isfinite(workspace.lower) | torch.isfinite(workspace.upper)).any())
+        return self.scene.workspace.has_faces
 
     @property
     def has_goal(self) -> bool:
         """Whether there is a goal."""
-        return bool((torch.isfinite(self.scene.goal.lower) | torch.isfinite(self.scene.goal.upper)).any())
+        return self.scene.goal.has_faces
 
     @property
     def asks(self) -> bool:
@@ -188,16 +187,19 @@ class _Cells:
                 tube = self.propagator.propagate(loop, cells, self.seen.disturbance)
             else:
                 done = run(loop, cells, self.seen.disturbance)
-                tube, recording = done.tube, _recording(done, loop)
+                tube, recording = done.tube, _recording(done)
         seconds = torch.full((len(owner),), (time.perf_counter() - began) / len(owner), dtype=torch.float64)
         nothing = torch.zeros(len(owner), loop.horizon, 0, dtype=torch.float64)
         return CellTubes(owner, cells, tube, nothing, nothing, seconds, recording)
 
 
-def _recording(run: object, loop: RecordedLoop) -> Recording | None:
-    """What a checker needs, of loops whose steps are all the same program; the recordings of others do not line up."""
-    make = getattr(run, "recording", None)
-    return None if make is None or len(loop.programs) > 1 else make()
+def _recording(run: Any) -> Recording | None:
+    """What a checker needs, of loops whose steps do the same operations; the recordings of others do not line up."""
+    bands = getattr(run, "bands", None)
+    if bands is None:
+        return None
+    shapes = {tuple((name, tuple(band.slope.shape[-1:])) for name, band in step) for step in bands}
+    return run.recording() if len(shapes) == 1 else None
 
 
 def _shortfall(tube: Tube, claim: LoopClaim) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ COMMANDS = [
     ["safety-rates"],
     ["run"],
     ["check"],
+    ["prove"],
     ["status"],
     ["inspect"],
     ["doctor"],
