@@ -9,14 +9,14 @@ from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 
 from sagemp_cli.errors import ConfigError, ResourceError
-from sagemp_cli.experts.problems import Demonstration, Expert, Problem, solve_problem
+from sagemp_cli.experts.problems import Demonstration, Expert, PlannedDemonstration, solve_problem
 from sagemp_cli.workers import be_a_worker, one_thread_per_child
 
 _expert: Expert | None = None  # a worker's own copy, sent once when it starts
 
 
 def solve_problems(
-    problems: Sequence[Problem], expert: Expert, *, processes: int = 2, done: Collection[int] = ()
+    problems: Sequence[PlannedDemonstration], expert: Expert, *, processes: int = 2, done: Collection[int] = ()
 ) -> Iterator[Demonstration]:
     """Solve all problems whose index is not in ``done``; yields in the order in which they finish.
 
@@ -39,7 +39,7 @@ def solve_problems(
     return _solve([problem for problem in problems if problem.index not in done], expert, processes)
 
 
-def _solve(todo: list[Problem], expert: Expert, processes: int) -> Iterator[Demonstration]:
+def _solve(todo: list[PlannedDemonstration], expert: Expert, processes: int) -> Iterator[Demonstration]:
     if processes == 0:
         for problem in todo:
             yield solve_problem(problem, expert)
@@ -76,6 +76,6 @@ def _start_worker(expert: Expert) -> None:
     _expert = expert
 
 
-def _solve_in_worker(problem: Problem) -> Demonstration:
+def _solve_in_worker(problem: PlannedDemonstration) -> Demonstration:
     assert _expert is not None, "the worker was not started"
     return solve_problem(problem, _expert)

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class PlannedDemonstration:
     """A start to demonstrate from; it depends on ``(seed, index)`` alone, not on which others were planned or solved.
 
     Attributes:
@@ -51,7 +51,7 @@ class Demonstration:
         seconds: processor time (differs from run to run; everything else is reproducible).
     """
 
-    problem: Problem
+    problem: PlannedDemonstration
     trajectory: Trajectory | None
     failure: str
     classes_tried: int
@@ -115,10 +115,10 @@ class Expert:
         )
 
 
-def plan_demonstrations(starts: Box, count: int, *, seed: int) -> list[Problem]:
+def plan_demonstrations(starts: Box, count: int, *, seed: int) -> list[PlannedDemonstration]:
     """Problems 0..count-1 with starts drawn uniformly from a box ``(n,)``.
 
-    Problem i is the same for every count, so a data set can be enlarged by planning again with a larger one.
+    Start i is the same for every count, so a data set can be enlarged by planning again with a larger one.
     """
     if count < 1:
         raise ConfigError(f"count of demonstrations must be at least 1, found {count}")
@@ -126,12 +126,12 @@ def plan_demonstrations(starts: Box, count: int, *, seed: int) -> list[Problem]:
         raise ConfigError(f"seed must not be negative, found {seed}")
     low, width = starts.lower.numpy(), starts.width.numpy()
     return [
-        Problem(index, seed, low + width * np.random.default_rng([seed, index, 0]).random(len(low)))
+        PlannedDemonstration(index, seed, low + width * np.random.default_rng([seed, index, 0]).random(len(low)))
         for index in range(count)
     ]
 
 
-def solve_problem(problem: Problem, expert: Expert) -> Demonstration:
+def solve_problem(problem: PlannedDemonstration, expert: Expert) -> Demonstration:
     """One demonstration, or the reason why there is none; never raises for a problem that is merely infeasible.
 
     Every plausible combination of sides (:func:`~sagemp_cli.experts.homotopy.guesses`) is optimised; of the
@@ -178,7 +178,7 @@ def solve_problem(problem: Problem, expert: Expert) -> Demonstration:
     return outcome(kept, "", len(paths), len(best))
 
 
-def _draw(ascending: list[Trajectory], temperature: float, problem: Problem) -> Trajectory:
+def _draw(ascending: list[Trajectory], temperature: float, problem: PlannedDemonstration) -> Trajectory:
     if temperature == 0:
         return ascending[0]
     excess = np.array([trajectory.cost - ascending[0].cost for trajectory in ascending])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.experts import Problem, Weights, plan_demonstrations, solve_problem
+from sagemp_cli.experts import PlannedDemonstration, Weights, plan_demonstrations, solve_problem
 from sagemp_cli.scenes import Block
 
 
@@ -43,21 +43,21 @@ def test_temperature_zero_keeps_the_cheapest_class(expert, starts):
 
 
 def test_a_start_inside_an_obstacle_gives_a_reason_and_no_trajectory(expert):
-    found = solve_problem(Problem(0, 0, np.array([2.0, -0.3, 0.0, 1.0])), expert)
+    found = solve_problem(PlannedDemonstration(0, 0, np.array([2.0, -0.3, 0.0, 1.0])), expert)
     assert found.trajectory is None
     assert found.failure == "the start lies inside obstacle 'first disc' (0.5 m deep)"
 
 
 def test_a_wall_across_the_workspace_gives_a_reason_and_no_trajectory(expert, slalom):
     walled = replace(expert, scene=replace(slalom, obstacles=(Block((3.0, -3.0), (4.0, 3.0), "wall"),)))
-    found = solve_problem(Problem(0, 0, np.array([0.0, 0.0, 0.0, 1.0])), walled)
+    found = solve_problem(PlannedDemonstration(0, 0, np.array([0.0, 0.0, 0.0, 1.0])), walled)
     assert found.trajectory is None
     assert found.failure == "no way between the obstacles: every via point beside them is blocked"
 
 
 def test_classes_that_all_fail_give_the_reason_of_the_shortest(expert):
     hurried = replace(expert, horizon=8, max_iterations=30)
-    found = solve_problem(Problem(0, 0, np.array([0.0, 0.0, 0.0, 1.0])), hurried)
+    found = solve_problem(PlannedDemonstration(0, 0, np.array([0.0, 0.0, 0.0, 1.0])), hurried)
     assert found.trajectory is None and found.classes_found == 0
     assert found.failure.startswith(f"none of {found.classes_tried} classes is feasible; the shortest: ")
 
