@@ -67,7 +67,7 @@ def said_rows(document: Document) -> list[tuple[str, str]]:
     robot = document.config.get("dynamics")
     said = {
         **document.said,
-        "robot": str(robot.get("_target_", ""))[:80].rpartition(".")[2] if isinstance(robot, Mapping) else None,
+        "robot": str(robot.get("name", "?"))[:80] if isinstance(robot, Mapping) else None,
         "between samples": None if document.dt is None else f"{document.dt:.6g} s",
         "names, units": "of states and controls",
     }

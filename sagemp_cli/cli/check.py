@@ -46,6 +46,7 @@ def check(
     [bold]--against[/bold] asks for, 2 if the file is damaged or changed.
     """
     from sagemp_cli.checker.check import check as prove
+    from sagemp_cli.checker.claim import claim_lines
     from sagemp_cli.cli.console import console_progress
 
     report = prove(file, processes=processes, progress=console_progress())
@@ -53,7 +54,9 @@ def check(
     if as_json:
         typer.echo(json.dumps(as_data(report, found), indent=2))
     else:
-        typer.echo(printable("\n".join([*as_lines(report), *([] if found is None else _against_lines(found))])))
+        claim = claim_lines(report.document, _TITLES[report.answer])
+        beside = [] if found is None else _against_lines(found)
+        typer.echo(printable("\n".join([*claim, *beside, *as_lines(report)])))
     code = ANSWER_CODES[report.answer]
     raise typer.Exit(code if found is None or code or all(d.covers for d in found) else ANSWER_CODES["UNKNOWN"])
 
@@ -79,8 +82,6 @@ def _against_lines(found: list[Difference]) -> list[str]:
 
 def as_lines(report: Report) -> list[str]:
     """What was proved and what was not, for people."""
-    from sagemp_cli.checker.claim import claim_lines
-
     proved = sum(f.proved for f in report.findings)
     lines = [
         f"{report.answer}: {proved} of {len(report.findings)} references proved, {report.cells} cells, K ="
@@ -92,7 +93,6 @@ def as_lines(report: Report) -> list[str]:
         lines.append("  the robot is a network learned from an analytical model; of that model itself:")
         lines += [_line(f, "  reference") for f in report.true_model]
     lines += [f"  counterexample to reference {r}: NOT PROVED: {why}" for r, why in report.counterexamples if why]
-    lines += claim_lines(report.document, _TITLES[report.answer])
     took = f"checked in {report.seconds:.2f} s"
     lines.append(f"{took}; the proof took {report.proof_seconds:.2f} s" if report.proof_seconds > 0 else took)
     return lines
