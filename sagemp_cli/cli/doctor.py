@@ -16,7 +16,7 @@ from sagemp_cli.cli.options import Json
 
 EXAMPLES = examples("sagemp doctor", "sagemp doctor --json | jq .propagators")
 _PACKAGES = ("torch", "numpy", "scipy", "h5py", "hydra-core", "typer", "rich", "matplotlib")
-_OPTIONAL = ("python-flint", "auto_LiRPA", "neuralsat")
+_OPTIONAL = ("python-flint", "onnx", "auto_LiRPA", "neuralsat")
 
 
 def doctor(as_json: Json = False) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.loop.controller import lookahead_errors
 from sagemp_cli.loop.onnx_format.tracker import OnnxTracker
@@ -43,6 +44,7 @@ def test_a_network_of_a_file_goes_through_all_stages_and_proves_the_same(work, n
     assert [p.role for p in tracker.header.parents] == ["network"]
     ours = read_artifact(toy_folder / "certificate.h5", type(certificate.record)).record
     assert certificate.record.verdict == ours.verdict
+    assert check(certificate.path).answer == ours.verdict
     np.testing.assert_allclose(certificate.record.tubes.tube_upper, ours.tubes.tube_upper, rtol=1e-9, atol=1e-9)
     assert bool(rollouts.record.in_tube.all()) and len(library.record.tubes.verdict) > 0
     states = survey(context, last="safety-rates")
