@@ -60,6 +60,10 @@ class ResourceError(UsageError):
     """The machine refuses: disk full, folder not writable, memory budget too small; nothing was written."""
 
 
+class TubeWarning(UserWarning):
+    """A tube is what it should be, but whoever reads it should know something about it."""
+
+
 class TimeLimitError(SagempError):
     """A time limit given by the user ran out."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
-from sagemp_cli.errors import UsageError, did_you_mean
+from sagemp_cli.errors import TubeWarning, UsageError, did_you_mean
 from sagemp_cli.plugins.registry import names, resolve
 from sagemp_cli.reachability.observed import check_box, observed
 from sagemp_cli.reachability.propagator import Loop, Propagator
@@ -67,6 +68,9 @@ def reach(
     Returns:
         The smallest boxes around the tubes of all cells; row 0 is the start box. Rows are infinite after an overflow.
 
+    Warns:
+        TubeWarning: what the propagator notes of the tube, for instance that it is wide because symbols were boxed.
+
     Raises:
         UnsupportedOperationError: an operation that cannot be bounded; the message names it and the line.
         NonFiniteError: a constant or a result that is NaN or infinite.
@@ -79,15 +83,20 @@ def reach(
     seen = observed(step, start, disturbance, horizon, batched=batched)
     loop, disturbance = seen.loop, seen.disturbance
 
+    notes: dict[str, None] = {}
+
     def tubes_of(cells: Box) -> Tube:
         chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
         with torch.no_grad():
-            tubes = [chosen.propagate(loop, Box(low, high), disturbance) for low, high in chunks]
-        return Tube(torch.cat([t.lower for t in tubes]), torch.cat([t.upper for t in tubes]))
+            found = [chosen.reach(loop, Box(low, high), disturbance) for low, high in chunks]
+        notes.update(dict.fromkeys(note for one in found for note in one.notes))
+        return Tube(torch.cat([one.tube.lower for one in found]), torch.cat([one.tube.upper for one in found]))
 
     tubes = _adapted(tubes_of, start) if counts is None else tubes_of(cells_of(start, counts))
     tube = tubes.hull()
     seen.compare(Box(tubes.lower[:, 0], tubes.upper[:, 0]), tube)
+    for note in notes:
+        warnings.warn(note, TubeWarning, stacklevel=2)
     return tubes if per_cell else tube
 
 

@@ -85,6 +85,8 @@ def run(context: StageContext) -> Path:
     beside = ("verify.falsifier", "verify.samples")  # no piece of the proof depends on them
     pieces = PartialResults.of(context, "verify", inputs, without=beside)
     verification = proof.verify(references, tracker, pieces=pieces, progress=context.progress)
+    for note in verification.notes:
+        context.progress.say(note)
     refutation = attack(
         verification,
         problem,

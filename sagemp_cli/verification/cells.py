@@ -74,6 +74,7 @@ class CellTubes:
         control_lower, control_upper: bounds of the controls, ``(C, K, m)``; infinite if the propagator offers none.
         seconds: share of the propagation time, ``(C,)``.
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
+        notes: of the propagator.
     """
 
     cell_reference: Tensor
@@ -83,6 +84,7 @@ class CellTubes:
     control_upper: Tensor
     seconds: Tensor
     recording: Recording | None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cell_reference)
@@ -97,6 +99,7 @@ class CellTubes:
             self.control_upper[index],
             self.seconds[index],
             None if self.recording is None else self.recording.select(index),
+            self.notes,
         )
 
     @staticmethod
@@ -113,6 +116,7 @@ class CellTubes:
             torch.cat([p.control_upper for p in parts]),
             torch.cat([p.seconds for p in parts]),
             Recording.join(recordings),
+            tuple(dict.fromkeys(note for p in parts for note in p.notes)),
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -135,6 +139,8 @@ class CellTubes:
         if self.recording is not None:
             arrays["operations"] = np.array(self.recording.operations, dtype=np.str_)
             arrays["widths"] = np.array(self.recording.widths, dtype=np.int64)
+        if self.notes:
+            arrays["notes"] = np.array(self.notes, dtype=np.str_)
         return arrays
 
     @classmethod
@@ -163,6 +169,7 @@ class CellTubes:
             found["control_upper"],
             found["seconds"],
             recording,
+            tuple(str(note) for note in arrays.get("notes", ())),
         )
 
 
@@ -197,7 +204,9 @@ class CellProver:
             u_upper = torch.minimum(u_upper, torch.nn.functional.pad(most, more, value=torch.inf))
         share = (time.perf_counter() - began) / len(chunk)
         seconds = torch.full((len(chunk),), share, dtype=torch.float64)
-        return CellTubes(chunk.cell_reference, chunk.cells, found.tube, u_lower, u_upper, seconds, found.recording)
+        return CellTubes(
+            chunk.cell_reference, chunk.cells, found.tube, u_lower, u_upper, seconds, found.recording, found.notes
+        )
 
 
 class Run(Protocol):

@@ -49,6 +49,7 @@ class Verification:
         propagator: its name.
         rigorous: whether rounding is included in the tubes.
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
+        notes: of the propagator, one line each.
     """
 
     references: Tensor
@@ -67,6 +68,7 @@ class Verification:
     propagator: str
     rigorous: bool
     recording: Recording | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return self.references.shape[0]
@@ -126,6 +128,7 @@ class Verification:
             goal_margin=cat([p.goal_margin for p in parts]),
             seconds=cat([p.seconds for p in parts]),
             recording=Recording.join([p.recording for p in parts]),
+            notes=tuple(dict.fromkeys(note for p in parts for note in p.notes)),
         )
 
 
@@ -226,6 +229,7 @@ def verify_references(
         propagator=propagator.name,
         rigorous=propagator.rigorous,
         recording=found.recording,
+        notes=found.notes,
     )
 
 

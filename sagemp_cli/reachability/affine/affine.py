@@ -27,6 +27,7 @@ import sagemp_cli.reachability.affine.operations  # noqa: F401  (gives the forms
 import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the relaxations)
 from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.reachability.affine.boxed import Boxed
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable, speaks_for_itself
 from sagemp_cli.reachability.affine.compiled.run import planned_run
 from sagemp_cli.reachability.affine.form import AffineForm, Hints, StepFrame
@@ -49,6 +50,7 @@ class AffineRun:
         kept: per step, the mask of the generators kept, ``(M,)`` or ``(*batch, M)``.
         steps: per step, the form of the next state (and in its frame, what went into it); empty unless asked for.
         controls: per step, bounds of the controls; empty unless asked for.
+        notes: what whoever reads the tube should know.
     """
 
     tube: Tube
@@ -56,6 +58,7 @@ class AffineRun:
     kept: list[Tensor] = field(default_factory=list, repr=False)
     steps: list[AffineForm] = field(default_factory=list, repr=False)
     controls: list[tuple[Tensor, Tensor]] = field(default_factory=list, repr=False)
+    notes: tuple[str, ...] = ()
 
     def recording(self) -> Recording:
         """What a certificate keeps of the run."""
@@ -83,11 +86,11 @@ class Affine(Propagator):
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
         run = self._fast_run(loop, start, disturbance, watch=watch)
         if not watch:
-            return Reach(run.tube)
+            return Reach(run.tube, notes=run.notes)
         lower, upper = (torch.stack(side, dim=-2) for side in zip(*run.controls, strict=True))
         bad = torch.isnan(lower) | torch.isnan(upper)
         lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
-        return Reach(run.tube, lower, upper, run.recording())
+        return Reach(run.tube, lower, upper, run.recording(), run.notes)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """Of M generators at the last step, as many as if none were negligible: ``M (6 n + 3 H) + 12 v^2`` numbers and
@@ -137,12 +140,13 @@ class Affine(Propagator):
             wanted = {"symbols": self.symbols, "hints": hints, "keep_steps": keep_steps, "watch": watch}
             with contextlib.suppress(NotFoldable):
                 found = planned_run(loop, start, disturbance, steps, **wanted)
-                return AffineRun(found.tube, found.bands, found.kept, found.steps, found.controls)
+                return AffineRun(found.tube, found.bands, found.kept, found.steps, found.controls, found.notes)
         center, reach = start.center, start.radius
         generators = torch.diag_embed(reach)
         lowers, uppers = [start.lower], [start.upper]
         w_center, w_radius = disturbance.center, disturbance.radius
         bands, masks, kept_steps, controls = [], [], [], []
+        boxed = Boxed(self.symbols)
         for k in range(steps):
             known = None if hints is None else hints[k]
             frame = StepFrame(generators, reach, w_radius, hints=known)
@@ -160,7 +164,9 @@ class Affine(Propagator):
             if keep_steps:
                 frame.condense()
                 kept_steps.append(after)
-            generators, mask = reduce_generators(generators, self.symbols)
+            every = generators
+            generators, mask = reduce_generators(every, self.symbols)
+            boxed.follow(every.detach(), mask)
             masks.append(mask)
             growth = 1.0 + 2 * (generators.shape[-1] + 8) * UNIT
             reach = generators.abs().sum(-1) * growth
@@ -170,7 +176,7 @@ class Affine(Propagator):
             if not bool(torch.isfinite(reach).all()):
                 lowers, uppers, center, generators, reach = _overflow(lowers, uppers, center, generators, reach)
         tube = Tube(torch.stack(lowers, -2), torch.stack(uppers, -2))
-        return AffineRun(tube, bands, masks, kept_steps, controls)
+        return AffineRun(tube, bands, masks, kept_steps, controls, boxed.notes())
 
 
 def _step(loop: Loop, k: int, watch: bool, x: Any, w: Any) -> tuple[Any, Any]:

@@ -50,11 +50,11 @@ class Best(Propagator):
         start = batched_start(loop, start, disturbance)
 
         def bounded(some: Loop, cells: Box) -> Reach:
-            return Reach(self._tube(some, cells, disturbance))
+            return self._bounded(some, cells, disturbance)
 
         return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
 
-    def _tube(self, loop: Loop, start: Box, disturbance: Box) -> Tube:
+    def _bounded(self, loop: Loop, start: Box, disturbance: Box) -> Reach:
         affine = Affine(symbols=self.symbols)
         hints: list[Hints] | None = None
         tubes: list[Tube] = []
@@ -64,7 +64,7 @@ class Best(Propagator):
             hints = found if hints is None else _sharper(hints, found)
             tubes += [run.tube, back]
         lower, upper = (torch.stack(sides) for sides in zip(*((t.lower, t.upper) for t in tubes), strict=True))
-        return Tube(lower.amax(0), upper.amin(0))
+        return Reach(Tube(lower.amax(0), upper.amin(0)), notes=run.notes)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """That of CROWN, and the bounds of all operations' inputs."""

@@ -55,7 +55,7 @@ class Crown(Propagator):
 
         def bounded(some: Loop, cells: Box) -> Reach:
             run = Affine(symbols=self.symbols).run(some, cells, disturbance, keep_steps=True)
-            return Reach(taken_back(run, cells, rows=self.rows)[0])
+            return Reach(taken_back(run, cells, rows=self.rows)[0], notes=run.notes)
 
         return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
 

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sagemp_cli.reachability.affine.boxed import Boxed
 from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable
 from sagemp_cli.reachability.affine.compiled.folding import Combination, Node, Plan, plan_of
 from sagemp_cli.reachability.affine.compiled.operations import (
@@ -57,6 +58,7 @@ class PlannedRun:
     kept: list[Tensor]
     steps: list[AffineForm]
     controls: list[tuple[Tensor, Tensor]]
+    notes: tuple[str, ...] = ()
 
 
 @torch.no_grad()
@@ -95,7 +97,7 @@ def planned_run(
     center, reach = (side.reshape(-1, n).numpy() for side in (start.center, start.radius))
     generators = reach[:, :, None] * np.eye(n)
     lowers, uppers, found = [low], [high], PlannedRun(Tube(start.lower, start.upper), [], [], [], [])
-    kept_steps, again = [], 0
+    kept_steps, again, boxed = [], 0, Boxed(symbols)
     for k in range(steps):
         known = None if hints is None else hints[k]
         states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
@@ -116,7 +118,7 @@ def planned_run(
         diagonal(generators, generators.shape[-1] - n)[...] = after.both[1] * (
             (after.error + (2 * n + 16) * UNIT) * SAFETY
         )
-        count, mask = generators.shape[-1], None
+        every, count, mask = generators, generators.shape[-1], None
         if count > (again if symbols is None else max(symbols, n + 1)):
             generators, mask = reduce_arrays(generators, symbols)
             again = max(generators.shape[-1] * 5 // 4, generators.shape[-1] + 64)
@@ -124,6 +126,7 @@ def planned_run(
             found.kept.append(torch.ones(count, dtype=torch.bool))
         else:
             found.kept.append(torch.from_numpy(mask) if mask.ndim == 1 else in_batch(mask))
+        boxed.follow(every, mask)
         reach = np.add.reduce(np.abs(generators), axis=-1) * (1.0 + 2 * (generators.shape[-1] + 8) * UNIT)
         spread = reach * (1.0 + 2 * UNIT) + np.abs(center) * (2 * UNIT)
         lowers.append(center - spread)
@@ -132,6 +135,7 @@ def planned_run(
             bad = ~np.isfinite(reach).all(-1)
             lowers[-1][bad], uppers[-1][bad] = -math.inf, math.inf
             center[bad], generators[bad], reach[bad] = math.nan, math.nan, math.nan
+    found.notes = boxed.notes()
     found.steps += forms_of(kept_steps, batch, disturbance.radius)
     found.tube = Tube(*(in_batch(np.stack(side, axis=1)) for side in (lowers, uppers)))
     return found
