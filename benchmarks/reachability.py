@@ -34,10 +34,11 @@ from inner import inner_estimate  # noqa: E402
 from learned import learned_unicycle  # noqa: E402
 from swarm import Swarm  # noqa: E402
 
-from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop  # noqa: E402
+from sagemp_cli.loop.closed_loop import ClosedLoop  # noqa: E402
 from sagemp_cli.reachability.affine.affine import Affine  # noqa: E402
 from sagemp_cli.reachability.crown.best import Best  # noqa: E402
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa  # noqa: E402
+from sagemp_cli.reachability.program.loops import RecordedLoop, recorded  # noqa: E402
 from sagemp_cli.reachability.propagator import Loop, Propagator  # noqa: E402
 from sagemp_cli.sets import Box, Tube  # noqa: E402
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions  # noqa: E402
@@ -119,16 +120,16 @@ def against_inner(tube: Tube, loop: Loop, start: Box, disturbance: Box, *, every
     return float(estimate.ratio(tube)[steps].nanmean())
 
 
-def prefix(loop: ClosedLoop, steps: int) -> FoldedLoop:
+def prefix(loop: ClosedLoop, start: Box, disturbance: Box, steps: int) -> RecordedLoop:
     """The first steps of a loop."""
-    folded = loop.folded()
-    return dataclasses.replace(folded, biases=folded.biases[..., :steps, :])
+    whole = recorded(loop, start, disturbance)
+    return dataclasses.replace(whole, numbers=whole.numbers[:steps], horizon=steps)
 
 
 @row("unicycle against auto_LiRPA")
 def unicycle_against_auto_lirpa(quick: bool) -> list[Figure]:
     case = cases.load("unicycle", FOLDER)
-    loop = prefix(case.loop(), 20 if quick else case.loop().horizon)
+    loop = prefix(case.loop(), case.start, case.disturbance, 20 if quick else case.loop().horizon)
 
     def run(propagator: Propagator, repeats: int) -> tuple[float, Tube]:
         return timed(lambda: propagator.propagate(loop, case.start, case.disturbance), repeats)
@@ -306,7 +307,7 @@ def rigour(quick: bool) -> list[Figure]:
 
 def _rigour(name: str) -> list[Figure]:
     case = cases.load(name, FOLDER)
-    loop, cells = case.loop().folded(), cells_of(case, 4)
+    loop, cells = case.loop(), cells_of(case, 4)
     rigorous, tube = timed(lambda: Affine().propagate(loop, cells, case.disturbance), 5)
     plain, other = timed(lambda: plain_affine.propagate(loop, cells, case.disturbance), 5)
     excess = (tube.width - other.width)[..., 1:, :] / other.width[..., 1:, :]
@@ -316,7 +317,7 @@ def _rigour(name: str) -> list[Figure]:
             rigorous / plain,
             "x",
             2.0,
-            note="plain: the same plan, sums and bands (which keep their own margins) without bookkeeping of rounding",
+            note="plain: the same compiled step, sums and bands (with their margins) without bookkeeping of rounding",
         ),
         Figure(f"{name}: what rounding adds to the width", float(excess[excess.isfinite()].max()), note="relative"),
     ]

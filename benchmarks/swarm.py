@@ -6,13 +6,12 @@ It knows nothing of the package but the protocol of a loop: ``step(k, x, w)``, `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.dynamics import Dynamics
-from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.trackers import Tracker
 
 VELOCITY = slice(6, 9)
@@ -29,7 +28,7 @@ class Swarm:
         robots: how many.
     """
 
-    single: FoldedLoop
+    single: ClosedLoop
     spring: Tensor
     rest: Tensor
     robots: int
@@ -49,8 +48,9 @@ class Swarm:
             spring[:, velocity, :, place] = -dynamics.dt * stiffness * pull
         rest = torch.zeros(robots, n, dtype=torch.float64)
         rest[:, :3] = offsets
-        folded = ClosedLoop(dynamics, tracker, shifted).folded()
-        return cls(folded, spring.reshape(robots * n, robots * n), rest.flatten(), robots)
+        return cls(
+            ClosedLoop(dynamics, tracker, shifted), spring.reshape(robots * n, robots * n), rest.flatten(), robots
+        )
 
     @property
     def horizon(self) -> int:
@@ -60,18 +60,16 @@ class Swarm:
     def state_dim(self) -> int:
         return self.robots * self.single.state_dim
 
-    given_dim: ClassVar[int] = 2
+    def numbers(self) -> Tensor:
+        return self.single.numbers().flatten(-2)
 
-    def given(self, k: int) -> Tensor:
-        return self.single.given(k)
-
-    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, None]:
+    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, None]:
         n = self.single.state_dim
-        states, disturbances = (
-            torch.stack([v[..., n * i : n * i + n] for i in range(self.robots)], dim=-2) for v in (x, w)
+        states, disturbances, windows = (
+            v.unflatten(-1, (self.robots, size)) for v, size in ((x, n), (w, n), (numbers, -1))
         )
-        alone = torch.flatten(self.single.step_given(given, states, disturbances)[0], -2)
+        alone = torch.flatten(self.single.step_given(windows, states, disturbances)[0], -2)
         return alone + torch.nn.functional.linear(x - self.rest, self.spring), None
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
-        return self.step_given(self.given(k), x, w)[0]
+        return self.step_given(self.numbers()[k], x, w)[0]

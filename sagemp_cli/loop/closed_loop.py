@@ -8,7 +8,6 @@ start, references ``p_0..p_K`` with ``p_0`` the reference's start; step ``k = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,7 +15,6 @@ from torch import Tensor
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.loop.controller import Controller
-from sagemp_cli.loop.tracker import Tracker
 
 
 @dataclass(frozen=True)
@@ -64,44 +62,26 @@ class ClosedLoop:
 
     def control(self, k: int, x: Tensor) -> Tensor:
         """``u_k``; of the paper's tracker ``pi(e_k)``, ``e_k = [p_{k+1} - x_k, ..., p_{k+N} - x_k]`` (equation 6)."""
-        return self.control_given(self.window(k), x)
+        return self.tracker.control(self.window(k), x)
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
         return self.dynamics.step(x, self.control(k, x), w)
 
-    given_dim: ClassVar[int] = 2
+    def numbers(self) -> Tensor:
+        """What each step has of its own, its window row by row, ``(K, ..., N n)``."""
+        steps = torch.arange(1, self.horizon + 1)
+        index = (steps[:, None] + torch.arange(self.tracker.lookahead)).clamp(max=self.horizon)
+        return self.references[..., index, :].movedim(-3, 0).flatten(-2)
 
-    def given(self, k: int) -> Tensor:
-        """What step k has of its own: its window."""
-        return self.window(k)
-
-    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """The next state and the control ``u_k``, for a window."""
-        u = self.control_given(given, x)
+    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state and the control ``u_k``, from the step's :meth:`numbers`."""
+        u = self.control_given(numbers, x)
         return self.dynamics.step(x, u, w), u
 
-    def control_given(self, given: Tensor, x: Tensor) -> Tensor:
-        """``u_k``, for a window."""
-        return self.tracker.control(given, x)
-
-    @property
-    def folds(self) -> bool:
-        """Whether there is a :meth:`folded` loop."""
-        return isinstance(self.tracker, Tracker) and self.tracker.folds
-
-    def folded(self) -> FoldedLoop:
-        """The same loop with the tracker's first layer folded onto the fixed references.
-
-        Raises:
-            UsageError: the tracker's first layer does not act on the lookahead errors (see :attr:`folds`).
-        """
-        if not self.folds:
-            raise UsageError(f"{type(self.tracker).__name__} has no first layer that could be folded")
-        assert isinstance(self.tracker, Tracker)
-        folds = [self.tracker.folded(self.window(k)) for k in range(self.horizon)]
-        biases = torch.stack([bias for _, bias in folds], dim=-2)
-        return FoldedLoop(self.dynamics, self.tracker, folds[0][0], biases)
+    def control_given(self, numbers: Tensor, x: Tensor) -> Tensor:
+        """``u_k``, from the step's :meth:`numbers`."""
+        return self.tracker.control(numbers.unflatten(-1, (self.tracker.lookahead, self.state_dim)), x)
 
     def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
         """Algorithm 1: states ``(..., K+1, n)`` and controls ``(..., K, m)`` from starts and disturbances.
@@ -115,48 +95,3 @@ class ClosedLoop:
             controls.append(self.control(k, states[-1]))
             states.append(self.dynamics.step(states[-1], controls[-1], w[..., k, :]))
         return torch.stack(states, dim=-2), torch.stack(controls, dim=-2)
-
-
-@dataclass(frozen=True)
-class FoldedLoop:
-    """A closed loop whose lookahead costs nothing: step k's first layer is ``weight @ x_k + biases[k]``.
-
-    Equal to the loop it was folded from in exact arithmetic (the sums over the lookahead are done once); in
-    floating point it differs by rounding, so what is proved of one holds for the other up to that.
-
-    Attributes:
-        dynamics: the robot.
-        tracker: the policy; only its layers after the first are used.
-        weight: ``(h, n)``, the same at every step.
-        biases: ``(..., K, h)``; leading dimensions are those of the references.
-    """
-
-    dynamics: Dynamics
-    tracker: Tracker
-    weight: Tensor
-    biases: Tensor
-
-    @property
-    def horizon(self) -> int:
-        """Number of steps K."""
-        return self.biases.shape[-2]
-
-    @property
-    def state_dim(self) -> int:
-        """Number of states n."""
-        return self.dynamics.state_dim
-
-    def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
-        """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
-        return self.step_given(self.given(k), x, w)[0]
-
-    given_dim: ClassVar[int] = 1
-
-    def given(self, k: int) -> Tensor:
-        """What step k has of its own: the bias of its first layer."""
-        return self.biases[..., k, :]
-
-    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """The next state and the control, for a bias."""
-        u = self.tracker.after_first(torch.nn.functional.linear(x, self.weight) + given)
-        return self.dynamics.step(x, u, w), u

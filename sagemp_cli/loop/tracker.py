@@ -20,9 +20,6 @@ class Tracker(Controller):
     The paper penalises control limits in training only. With ``saturate`` the network's output is cut off at +-1, so
     that every control lies within ``control_offset +- control_scale``, whatever the error: what is proved then needs
     no actuator that does more.
-
-    Because the reference is fixed in a proof, the first layer on ``[p_{k+1} - x_k, ..., p_{k+N} - x_k]`` is one
-    n-input linear layer whose bias depends on k: :meth:`folded` gives that form.
     """
 
     error_scale: Tensor
@@ -77,18 +74,9 @@ class Tracker(Controller):
         """Controls ``(..., m)``; see :class:`~sagemp_cli.loop.controller.Controller`."""
         return self(self.features(window, x))
 
-    @property
-    def folds(self) -> bool:
-        """Whether :meth:`folded` says what the first layer does: not of a class of one's own with other features."""
-        own = type(self)
-        return own.features is Tracker.features and own.control is Tracker.control and own.forward is Tracker.forward
-
     def forward(self, errors: Tensor) -> Tensor:
         """Controls ``(..., m)`` from lookahead errors (or other features) ``(..., N, n)``."""
-        return self.after_first(self.layers[0]((errors * self.error_scale).flatten(-2)))
-
-    def after_first(self, h: Tensor) -> Tensor:
-        """Controls ``(..., m)`` from what the first layer gives ``(..., h)``, before its activation."""
+        h = self.layers[0]((errors * self.error_scale).flatten(-2))
         for layer in self.layers[1:]:
             h = layer(nn.functional.leaky_relu(h, self.negative_slope))
         if self.saturate:
@@ -99,17 +87,6 @@ class Tracker(Controller):
         """What no control leaves in real arithmetic, ``(m,)`` each, rounded outwards; infinite unless it saturates."""
         reach = self.control_scale.abs() if self.saturate else torch.full_like(self.control_scale, torch.inf)
         return _outwards(self.control_offset, -reach), _outwards(self.control_offset, reach)
-
-    def folded(self, window: Tensor) -> tuple[Tensor, Tensor]:
-        """First layer on a fixed window ``(..., N, n)`` as ``weight @ x + bias``: ``(h, n)`` and ``(..., h)``.
-
-        Equal to the first layer of :meth:`forward` in exact arithmetic.
-        """
-        first = self.layers[0]
-        assert isinstance(first, nn.Linear)
-        blocks = first.weight.unflatten(-1, (self.lookahead, self.state_dim)) * self.error_scale
-        bias = torch.einsum("hjn,...jn->...h", blocks, window) + first.bias
-        return -blocks.sum(1), bias
 
 
 def _outwards(a: Tensor, b: Tensor) -> Tensor:

@@ -6,20 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
-from sagemp_cli.reachability.program.arithmetic import elementwise
-from sagemp_cli.reachability.program.loops import RecordedLoop, record, recorded
+from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
 from sagemp_cli.reachability.program.stored import to_record
 from sagemp_cli.storage import LoopRecord, ProgramRecord
-from sagemp_cli.verification.deviation import FOLDED
+from sagemp_cli.verification.deviation import ComparedLoop
 
 
+@torch.no_grad()
 def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
     """The loop of a problem under a tracker; the same whatever the references."""
     dynamics = problem.dynamics
@@ -36,18 +34,11 @@ def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
     )
 
 
+@torch.no_grad()
 def deviation_record(problem: Problem, tracker: Controller) -> ProgramRecord:
     """The step of a learned robot's analytical model by way of the network: w enlarged by what the two differ by."""
-    robot, loop = problem.dynamics, _loop(problem, tracker)
-    assert isinstance(robot, Learned)
-    shape = loop.window(0).shape
-
-    def step(x: Tensor, w: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        u = loop.control_given(numbers.reshape(shape), x)
-        derivative, deviation = robot.compared(x, u)
-        return robot.advance(x, derivative, w + elementwise(FOLDED, deviation)), u, deviation
-
-    return to_record(record(step, problem.start.center, problem.disturbance.center, loop.window(0).reshape(-1)))
+    loop = ComparedLoop(_loop(problem, tracker))
+    return to_record(recorded(loop, problem.start, problem.disturbance).programs[0])
 
 
 def strangers_loop_record(

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
-from sagemp_cli.reachability.program.loops import RecordedLoop
+from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
 
 
-def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
-    """The start box, broadcast against the batch of the loop's references.
+def recorded_and_batched(loop: Loop, start: Box, disturbance: Box) -> tuple[RecordedLoop, Box]:
+    """The loop as programs, and the start box in the batch shape that both have together.
 
     Args:
-        loop: a :class:`~.closed_loop.ClosedLoop`, folded or not, or a recorded loop may have a batch; any other loop
-            has none of its own.
+        loop: what steps; a recorded one may have a batch.
         start: ``(..., n)``.
         disturbance: ``(d,)``.
 
@@ -29,12 +26,6 @@ def batched_start(loop: Loop, start: Box, disturbance: Box) -> Box:
         raise UsageError(f"the start box has {start.dim} dimensions, the loop's state has {n}")
     if disturbance.lower.dim() != 1:
         raise UsageError(f"the disturbance must be one box (d,), found shape {tuple(disturbance.lower.shape)}")
-    own = torch.Size()
-    if isinstance(loop, ClosedLoop):
-        own = loop.references.shape[:-2]
-    elif isinstance(loop, FoldedLoop):
-        own = loop.biases.shape[:-2]
-    elif isinstance(loop, RecordedLoop):
-        own = loop.batch
-    shape = (*np.broadcast_shapes(own, start.lower.shape[:-1]), n)
-    return Box(start.lower.expand(shape), start.upper.expand(shape))
+    known = recorded(loop, start, disturbance)
+    shape = (*np.broadcast_shapes(known.batch, start.lower.shape[:-1]), n)
+    return known, Box(start.lower.expand(shape), start.upper.expand(shape))

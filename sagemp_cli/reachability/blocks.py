@@ -7,13 +7,12 @@ from collections.abc import Callable
 
 import torch
 
-from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
 from sagemp_cli.reachability.program.loops import RecordedLoop
-from sagemp_cli.reachability.propagator import Loop, Reach
+from sagemp_cli.reachability.propagator import Reach
 from sagemp_cli.sets import Box, Tube
 
 
-def in_blocks(bounded: Callable[[Loop, Box], Reach], loop: Loop, start: Box, *, at_once: int) -> Reach:
+def in_blocks(bounded: Callable[[RecordedLoop, Box], Reach], loop: RecordedLoop, start: Box, *, at_once: int) -> Reach:
     """The tube and the notes of all cells.
 
     Args:
@@ -37,21 +36,8 @@ def in_blocks(bounded: Callable[[Loop, Box], Reach], loop: Loop, start: Box, *, 
     return Reach(tube, notes=tuple(dict.fromkeys(note for p in parts for note in p.notes)))
 
 
-def some_of(loop: Loop, batch: torch.Size, cells: slice) -> Loop:
+def some_of(loop: RecordedLoop, batch: torch.Size, cells: slice) -> RecordedLoop:
     """The loop of some of the cells of a batch, in one row."""
-    if isinstance(loop, ClosedLoop):
-        rows = loop.references
-        if rows.dim() > 2:
-            rows = rows.expand(*batch, *rows.shape[-2:]).flatten(0, -3)[cells]
-        return dataclasses.replace(loop, references=rows)
-    if isinstance(loop, FoldedLoop):
-        rows = loop.biases
-        if rows.dim() > 2:
-            rows = rows.expand(*batch, *rows.shape[-2:]).flatten(0, -3)[cells]
-        return dataclasses.replace(loop, biases=rows)
-    if isinstance(loop, RecordedLoop) and len(loop.batch):
-        between = (1,) * (len(batch) - len(loop.batch))
-        numbers = loop.numbers.reshape(loop.horizon, *between, *loop.numbers.shape[1:])
-        numbers = numbers.expand(loop.horizon, *batch, -1).flatten(1, -2)
-        return dataclasses.replace(loop, numbers=numbers[:, cells])
-    return loop
+    if not len(loop.batch):
+        return loop
+    return dataclasses.replace(loop, numbers=loop.numbers_in(batch).flatten(1, -2)[:, cells])

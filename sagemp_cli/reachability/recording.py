@@ -6,6 +6,7 @@ bad choice only makes its tube wider, or its check of the recorded radius fail.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,20 +45,25 @@ class Recording:
     kept: Tensor | None = None
 
     @staticmethod
-    def of(bands: Sequence[Sequence[tuple[str, Band]]], batch: torch.Size, kept: Sequence[Tensor]) -> Recording:
-        """From a run's bands and masks of kept generators, ``(columns,)`` or ``(*batch, columns)``, per step."""
+    def of(bands: Sequence[Sequence[tuple[str, Band]]], batch: torch.Size, kept: Sequence[np.ndarray]) -> Recording:
+        """From a run's bands and masks of kept generators, ``(columns,)`` or ``(B, columns)``, per step.
+
+        Args:
+            bands: in the order of evaluation, ``(B, E)`` each, of the B cells of the batch.
+            batch: its shape.
+            kept: masks.
+        """
+        cells, first = math.prod(batch), bands[0]
 
         def stacked(part: int) -> Tensor:
-            def entries(step: Sequence[tuple[str, Band]]) -> Tensor:
-                rows = [band[part].expand(batch + _own(band, batch)).reshape(*batch, -1) for _, band in step]
-                return torch.cat(rows, -1)
+            rows = [
+                np.concatenate([np.zeros((cells, 0)), *(band[part] for _, band in step)], axis=-1) for step in bands
+            ]
+            return torch.from_numpy(np.stack(rows, axis=1)).reshape(*batch, len(bands), -1)
 
-            return torch.stack([entries(step) if step else torch.zeros(*batch, 0) for step in bands], dim=-2).double()
-
-        first = bands[0]
         return Recording(
             operations=tuple(name for name, _ in first),
-            widths=tuple(_own(band, batch).numel() for _, band in first),
+            widths=tuple(band.radius.shape[-1] for _, band in first),
             slope=stacked(0),
             offset=stacked(1),
             radius=stacked(2),
@@ -91,17 +97,13 @@ class Recording:
         )
 
 
-def _own(band: Band, batch: torch.Size) -> torch.Size:
-    """The event shape of a band."""
-    return torch.Size(np.broadcast_shapes(*(part.shape for part in band))[len(batch) :])
-
-
-def _packed(masks: Sequence[Tensor], batch: torch.Size) -> Tensor:
+def _packed(masks: Sequence[np.ndarray], batch: torch.Size) -> Tensor:
     """Masks of several lengths as rows of bits, least significant first, padded with zeros."""
     size = -(-max(m.shape[-1] for m in masks) // 8)
-    rows = torch.stack([_padded(m, 8 * size).expand(*batch, -1) for m in masks], dim=-2)
-    weights = 2 ** torch.arange(8, dtype=torch.int64)
-    return (rows.unflatten(-1, (size, 8)).long() * weights).sum(-1).to(torch.uint8)
+    rows = np.zeros((math.prod(batch), len(masks), 8 * size), dtype=bool)
+    for k, mask in enumerate(masks):
+        rows[:, k, : mask.shape[-1]] = mask
+    return torch.from_numpy(np.packbits(rows, axis=-1, bitorder="little")).reshape(*batch, len(masks), size)
 
 
 def _padded(rows: Tensor, size: int) -> Tensor:

@@ -8,11 +8,13 @@ with a limit, negligible ones are the last to be kept anyway, and boxing them ea
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.sets.rounding import UNIT
+from sagemp_cli.sets.rounding import at_least
 
 NEGLIGIBLE = 1e-10
 """A generator is negligible if no entry of it exceeds this share of its coordinate's radius, in no cell of a batch.
@@ -20,58 +22,48 @@ NEGLIGIBLE = 1e-10
 A box around m of them adds at most ``m`` times as much to the radius: a millionth for ten thousand."""
 
 
-def reduce_generators(generators: Tensor, limit: int | None = None) -> tuple[Tensor, Tensor]:
+def reduced(generators: Any, limit: int | None = None) -> tuple[Any, np.ndarray | None]:
     """Drop negligible generators; or if there is a limit, all but those that matter most.
 
     Sound: the dropped generators ``g_j`` are enclosed by the box of radius ``sum_j |g_j|`` (rounded up).
 
     Args:
-        generators: ``(*batch, n, M)``.
+        generators: ``(B, n, M)``, an array or a tensor.
         limit: most generators of the result (at least n+1 are kept); None for no limit.
 
     Returns:
         Generators, the kept ones first and in their old order, then (if any were dropped) the n of the box; and the
-        mask of the kept ones, ``(M,)`` if it is the same for the whole batch, else ``(*batch, M)``.
+        mask of the kept ones, ``(M,)`` if it is the same for the whole batch, else ``(B, M)``, as many in every cell;
+        None if all are kept.
     """
-    batch, (n, count) = generators.shape[:-2], generators.shape[-2:]
-    flat = generators.reshape(-1, n, count)
-    chosen = _chosen(np.abs(flat.detach().numpy()), limit)
-    if chosen is None:
-        return generators, torch.ones(count, dtype=torch.bool)
-    mask = torch.from_numpy(chosen)
-    if mask.dim() == 1:
-        kept, dropped = generators[..., mask], generators[..., ~mask]
-    else:
-        mask = mask.reshape(*batch, count)
-        every = mask[..., None, :].expand(generators.shape)
-        kept, dropped = (generators[part].reshape(*batch, n, -1) for part in (every, ~every))
-    radius = dropped.abs().sum(-1) * _rounded_up(dropped.shape[-1])
-    return torch.cat([kept, torch.diag_embed(radius)], dim=-1), mask
-
-
-def reduce_arrays(generators: np.ndarray, limit: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """As :func:`reduce_generators` for an array ``(B, n, M)``; the mask is None where all are kept."""
-    cells, n, _ = generators.shape
+    if isinstance(generators, Tensor):
+        mask = _chosen(np.abs(generators.detach().numpy()), limit)
+        return (generators, None) if mask is None else (_reduced_tensor(generators, torch.from_numpy(mask)), mask)
     size = np.abs(generators)
     mask = _chosen(size, limit)
-    if mask is None:
-        return generators, None
+    return (generators, None) if mask is None else (_reduced_array(generators, size, mask), mask)
+
+
+def _reduced_tensor(generators: Tensor, mask: Tensor) -> Tensor:
+    cells, n, _ = generators.shape
+    every = mask.expand(cells, -1)[:, None].expand(generators.shape)
+    kept, dropped = (generators[part].reshape(cells, n, -1) for part in (every, ~every))
+    return torch.cat([kept, torch.diag_embed(dropped.abs().sum(-1) * at_least(mask.shape[-1]))], dim=-1)
+
+
+def _reduced_array(generators: np.ndarray, size: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    cells, n, _ = generators.shape
     if mask.ndim == 1:
         kept, dropped = generators[..., mask], size @ (~mask).astype(float)
-    else:  # as many in every cell
+    else:
         index = np.nonzero(mask)[1].reshape(cells, 1, -1)
         kept = np.take_along_axis(generators, np.broadcast_to(index, (cells, n, index.shape[-1])), axis=-1)
         dropped = (size @ (~mask).astype(float)[..., None])[..., 0]
     count = kept.shape[-1]
-    reduced = np.zeros((cells, n, count + n))
-    reduced[..., :count] = kept
-    reduced.reshape(cells, -1)[:, count :: count + n + 1] = dropped * _rounded_up(size.shape[-1])
-    return reduced, mask
-
-
-def _rounded_up(count: int) -> float:
-    """What makes a computed sum of so many magnitudes an upper bound."""
-    return 1.0 + 2 * (count + 2) * UNIT
+    out = np.zeros((cells, n, count + n))
+    out[..., :count] = kept
+    out.reshape(cells, -1)[:, count :: count + n + 1] = dropped * at_least(size.shape[-1])
+    return out
 
 
 @np.errstate(all="ignore")  # where a set has overflowed any choice will do

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,17 +26,10 @@ from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.form import Form, Operation
+from sagemp_cli.reachability.program.arithmetic import identity
 from sagemp_cli.reachability.propagator import Footprint, Loop, LoopSize, Propagator, Reach
-from sagemp_cli.reachability.relaxations.band import Band, settled
-from sagemp_cli.reachability.relaxations.functions import functions_of
-from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.sets import Box
-from sagemp_cli.sets.rounding import TINY, UNIT
 from sagemp_cli.verification.verification import Verification
-
-FOLDED = "identity"
-"""Name under which folding is recorded: the identity function, relaxed by a constant."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +57,7 @@ class Folded(Propagator):
         if not isinstance(loop, ClosedLoop) or not isinstance(loop.dynamics, Learned):
             found = type(loop.dynamics if isinstance(loop, ClosedLoop) else loop).__name__
             raise UsageError(f"only a learned robot deviates from a model, found {found}")
-        return self.affine.reach(_FoldingLoop(loop), start, disturbance, watch=watch)
+        return self.affine.reach(ComparedLoop(loop), start, disturbance, watch=watch)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """That of the affine propagator."""
@@ -72,51 +65,39 @@ class Folded(Propagator):
 
 
 @dataclass(frozen=True)
-class _FoldingLoop:
-    """A closed loop that folds as it steps; what is watched are controls and deviations."""
+class ComparedLoop:
+    """A learned robot's closed loop whose disturbance is enlarged by what the robot deviates from its model.
+
+    Attributes:
+        loop: of the learned robot.
+    """
 
     loop: ClosedLoop
-    given_dim: ClassVar[int] = ClosedLoop.given_dim
 
     @property
     def horizon(self) -> int:
+        """Number of steps K."""
         return self.loop.horizon
 
     @property
     def state_dim(self) -> int:
+        """Number of states n."""
         return self.loop.state_dim
 
-    def given(self, k: int) -> Tensor:
-        return self.loop.given(k)
+    def numbers(self) -> Tensor:
+        """What each step has of its own, ``(K, ..., g)``."""
+        return self.loop.numbers()
 
-    def step_given(self, given: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The next state, the control and the deviation; a proof keeps of the last no more than its bounds."""
         robot = self.loop.dynamics
-        u = self.loop.control_given(given, x)
+        u = self.loop.control_given(numbers, x)
         derivative, deviation = robot.compared(x, u)
-        return robot.advance(x, derivative, w + folded(deviation)), torch.cat([u, deviation], dim=-1)
+        return robot.advance(x, derivative, w + identity(deviation)), u, deviation
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
-        return self.step_given(self.given(k), x, w)[0]
-
-
-def folded(value: Form) -> Form:
-    """A value of which only its bounds are kept."""
-    return value.relaxed(FOLDED, _KEEPS_BOUNDS)
-
-
-def _band(lower: Any, upper: Any) -> Band:
-    """A constant band; of tensors or of arrays."""
-    center = 0.5 * (lower + upper)
-    radius = functions_of(lower).maximum(upper - center, center - lower) * (1.0 + 4 * UNIT) + TINY
-    return settled(0.0 * center, center, radius)
-
-
-def _lines(lower: Tensor, upper: Tensor) -> Lines:
-    level = torch.zeros_like(lower)
-    return Lines(level, lower, level, upper)
-
-
-_KEEPS_BOUNDS = Operation(_band, _lines, lambda lower, upper: (lower, upper), arrays=True)
+        """``x_{k+1}`` of the analytical model."""
+        return self.step_given(self.numbers()[k], x, w)[0]
 
 
 def split(found: Verification, controls: int) -> tuple[Verification, Tensor]:

@@ -23,26 +23,23 @@ def unicycle_loop(references: torch.Tensor, seed: int = 0) -> ClosedLoop:
     return ClosedLoop(dynamics, tracker, references)
 
 
-def test_folding_the_first_layer_changes_a_step_by_rounding_only():
-    generator = torch.Generator().manual_seed(1)
-    loop = unicycle_loop(torch.randn(3, 1, 7, 4, dtype=torch.float64, generator=generator))
-    folded = loop.folded()
-    assert (folded.horizon, folded.state_dim) == (6, 4)
-    x = torch.randn(3, 5, 4, dtype=torch.float64, generator=generator)
-    w = torch.randn(3, 5, 4, dtype=torch.float64, generator=generator)
+def test_the_numbers_of_a_step_are_its_padded_window():
+    loop = unicycle_loop(torch.randn(3, 1, 7, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))
+    numbers = loop.numbers()
+    assert numbers.shape == (6, 3, 1, 16)
     for k in range(6):
-        torch.testing.assert_close(folded.step(k, x, w), loop.step(k, x, w), rtol=1e-14, atol=1e-14)
+        assert torch.equal(numbers[k], loop.window(k).flatten(-2))
+    last = loop.references[..., -1, :]
+    assert torch.equal(numbers[-1], torch.cat([last] * 4, dim=-1))  # step K-1 reads p_K and three copies of it
 
 
-def test_the_folded_first_layer_reads_the_padded_lookahead():
-    references = torch.zeros(4, 4, dtype=torch.float64)
-    references[-1] = 1.0
-    loop = unicycle_loop(references)
-    weight, bias = loop.folded().weight, loop.folded().biases[-1]
-    x = torch.full((4,), 0.25, dtype=torch.float64)
-    padded = loop.references[-1].expand(4, 4)  # step K-1 reads p_K and three copies of it
-    expected = loop.tracker.layers[0](((padded - x) * loop.tracker.error_scale).flatten())
-    torch.testing.assert_close(weight @ x + bias, expected, rtol=1e-13, atol=1e-13)
+def test_a_step_from_its_numbers_is_the_step_and_its_control():
+    generator = torch.Generator().manual_seed(1)
+    loop = unicycle_loop(torch.randn(7, 4, dtype=torch.float64, generator=generator))
+    x, w = torch.randn(2, 5, 4, dtype=torch.float64, generator=generator)
+    for k, numbers in enumerate(loop.numbers()):
+        after, control = loop.step_given(numbers, x, w)
+        assert torch.equal(after, loop.step(k, x, w)) and torch.equal(control, loop.control(k, x))
 
 
 def test_a_rollout_repeats_its_steps():

@@ -6,7 +6,7 @@ import torch
 
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets.order_reduction import NEGLIGIBLE, reduce_arrays, reduce_generators
+from sagemp_cli.sets.order_reduction import NEGLIGIBLE, reduced
 
 from ..reachability.propagator_cases import DISTURBANCE, START, line, unicycle_loop
 
@@ -20,12 +20,12 @@ def drawn(cells=3, n=4, count=40, small=()):
 @pytest.mark.parametrize("limit", [None, 30, 12, 1])
 def test_the_result_contains_every_vertex_that_the_generators_reach(limit):
     g = drawn(small=range(5, 25))
-    reduced, mask = reduce_generators(g, limit)
-    assert limit is None or reduced.shape[-1] <= max(limit, 5)
+    found, mask = reduced(g, limit)
+    assert limit is None or found.shape[-1] <= max(limit, 5)
     signs = torch.sign(torch.randn(200, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))
-    mask = mask.expand(3, -1)
+    mask = torch.from_numpy(mask).expand(3, -1)
     for c in range(3):
-        kept, box = reduced[c, :, : int(mask[c].sum())], reduced[c, :, int(mask[c].sum()) :]
+        kept, box = found[c, :, : int(mask[c].sum())], found[c, :, int(mask[c].sum()) :]
         torch.testing.assert_close(kept, g[c][:, mask[c]], rtol=0, atol=0)
         rest = signs[:, ~mask[c]] @ g[c][:, ~mask[c]].T
         assert bool((rest.abs() <= box.sum(-1)).all()) and bool((box - torch.diag_embed(box.diagonal()) == 0).all())
@@ -34,9 +34,9 @@ def test_the_result_contains_every_vertex_that_the_generators_reach(limit):
 def test_only_what_is_negligible_in_every_cell_and_state_is_dropped():
     g = drawn(small=range(30))
     g[1, 2, 7] = 10 * NEGLIGIBLE * float(g[1, 2].abs().sum())
-    reduced, mask = reduce_generators(g)
-    assert mask.tolist() == [j == 7 or j >= 30 for j in range(40)] and reduced.shape == (3, 4, 11 + 4)
-    widened = reduced.abs().sum(-1) / g.abs().sum(-1)
+    found, mask = reduced(g)
+    assert mask.tolist() == [j == 7 or j >= 30 for j in range(40)] and found.shape == (3, 4, 11 + 4)
+    widened = found.abs().sum(-1) / g.abs().sum(-1)
     assert bool((widened >= 1 - 1e-14).all()) and float(widened.max()) < 1 + 1e-11
 
 
@@ -44,16 +44,16 @@ def test_only_what_is_negligible_in_every_cell_and_state_is_dropped():
 def test_arrays_are_reduced_as_tensors_are(limit):
     g = drawn(small=range(5, 25))
     for some in (g, g[..., 25:]):
-        tensor, mask = reduce_generators(some, limit)
-        array, kept = reduce_arrays(some.numpy(), limit)
+        tensor, mask = reduced(some, limit)
+        array, kept = reduced(some.numpy(), limit)
         np.testing.assert_allclose(array, tensor.numpy(), rtol=1e-14, atol=0)
-        assert bool(mask.all()) if kept is None else np.array_equal(kept, mask.numpy())
+        assert (mask is None and kept is None) or np.array_equal(kept, mask)
 
 
 def test_few_negligible_generators_stay_because_a_box_is_not_smaller():
     g = drawn(small=range(4))
-    reduced, mask = reduce_generators(g)
-    assert reduced is g and bool(mask.all())
+    found, mask = reduced(g)
+    assert found is g and mask is None
 
 
 def test_a_long_tube_keeps_few_generators_and_its_width():

@@ -55,34 +55,6 @@ def test_leading_dimensions_are_batch(make_tracker):
     torch.testing.assert_close(tracker(errors)[1, 4], tracker(errors[1, 4]), rtol=1e-14, atol=1e-14)
 
 
-def test_folding_is_exact_in_rational_arithmetic(make_tracker):
-    """Weights, errors and scales are small dyadic numbers, so floating point makes no rounding error either."""
-    tracker = make_tracker(error_scale=[1, 2, 0.5, 4])
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for parameter in tracker.layers[0].parameters():
-            parameter.copy_(torch.randint(-64, 65, parameter.shape, generator=generator) / 32.0)
-    window = torch.randint(-128, 129, (3, 4), generator=generator) / 16.0
-    x = torch.randint(-128, 129, (4,), generator=generator) / 16.0
-    weight, bias = (part.detach() for part in tracker.folded(window.double()))
-    first, scale = tracker.layers[0], [Fraction(float(s)) for s in tracker.error_scale]
-    for row in range(8):
-        exact = Fraction(first.bias[row].item())
-        for j in range(3):
-            for i in range(4):
-                error = Fraction(float(window[j, i])) - Fraction(float(x[i]))
-                exact += Fraction(first.weight[row, 4 * j + i].item()) * scale[i] * error
-        assert Fraction(float(weight[row] @ x.double() + bias[row])) == exact
-
-
-def test_folding_serves_a_batch_of_windows(make_tracker):
-    tracker = make_tracker()
-    window = torch.randn(6, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    weight, bias = tracker.folded(window)
-    assert weight.shape == (8, 4) and bias.shape == (6, 8)
-    torch.testing.assert_close(bias[2], tracker.folded(window[2])[1], rtol=1e-14, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

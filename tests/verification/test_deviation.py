@@ -9,9 +9,7 @@ from sagemp_cli.dynamics import Unicycle
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
-from sagemp_cli.reachability.affine import affine
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.affine.compiled.foldable_loop import NotFoldable
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.deviation import Folded
 
@@ -67,21 +65,9 @@ def test_tube_controls_and_deviations_enclose_the_analytical_loop(robot):
     assert (bound[:, 0] < 1.2 * widest[:, 0] + 0.02 * W.upper[0]).all()  # the drift, and little more
 
 
-def test_on_arrays_the_proof_is_that_on_tensors(robot, monkeypatch):
-    def refuse(*_, **__):
-        raise NotFoldable
-
-    loop = loop_of(robot)
-    found = Folded(Affine()).reach(loop, START, W, watch=True)
-    monkeypatch.setattr(affine, "planned_run", refuse)
-    slow = Folded(Affine()).reach(loop, START, W, watch=True)
-    pairs = [(r.tube.lower, r.tube.upper, r.control_lower, r.control_upper) for r in (found, slow)]
-    record, slow_record = found.recording, slow.recording
-    for mine, theirs in zip(*pairs, strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
-    assert (record.operations, record.widths) == (slow_record.operations, slow_record.widths)
+def test_the_deviation_is_recorded_as_one_identity(robot):
+    record = Folded(Affine()).reach(loop_of(robot), START, W, watch=True).recording
     assert record.operations.count("identity") == 1
-    torch.testing.assert_close(record.radius, slow_record.radius, rtol=1e-6, atol=1e-9)
 
 
 def test_the_learned_robots_own_tube_does_not_enclose_the_analytical_loop(robot):

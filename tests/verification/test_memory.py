@@ -97,7 +97,7 @@ def test_a_proof_about_a_learned_robots_model_counts_what_it_adds(learned_unicyc
 def test_reduced_symbols_take_less_and_longer_horizons_more():
     short, long, reduced = needs(Affine()), needs(Affine(), 500), needs(Affine(symbols=100), 500)
     assert short.working < reduced.working < 0.3 * long.working
-    assert 8 * short.working < long.working < 12 * short.working
+    assert 8 * short.working < long.working < 13 * short.working  # and a bit per generator and step
     assert short.kept < 0.15 * long.kept
 
 

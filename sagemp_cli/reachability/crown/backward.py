@@ -30,7 +30,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.crown.backward_steps import LEAD, Array, Inputs, Product, Replacement, Step
 from sagemp_cli.reachability.crown.steps import Extent, Steps
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, at_least, gamma, slack
 
 
 @dataclass(frozen=True)
@@ -169,15 +169,15 @@ class _Sweep:
         gain = lead[:, 0] + (rounding * lead[:, 1] + TINY)
         constant = self._constant[:, : self._count]
         constant += gain
-        constant += (np.abs(constant) + np.abs(gain)) * (4 * UNIT)
+        constant += slack(np.abs(constant) + np.abs(gain), 4)
         self._states[..., : self._count] = self._values[:, LEAD : LEAD + n, : self._count]
 
     def upper(self) -> Array:
         """Upper bounds of all rows over the start box, ``(B, rows)``; infinite where there are none."""
         n = self._states.shape[-2]
         reach = (self._radius @ np.abs(self._states))[:, 0]
-        upper = self._constant + reach * (1.0 + (2 * n + 8) * UNIT)
-        upper += (np.abs(upper) + reach) * (4 * UNIT)
+        upper = self._constant + reach * at_least(n)
+        upper += slack(np.abs(upper) + reach, 4)
         return np.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=math.inf)
 
     def _split(self, rows: Array) -> Array:
@@ -222,7 +222,7 @@ def _tilt(head: Array, parts: Array, product: Product, shape: Array, own: Array)
     steep = np.where(inside, 0.5 * steep, product.size)
     cost = np.where(2 * steep <= product.free, steep * steep, (steep - 0.25 * product.free) * product.free)
     cost += product.top
-    cost *= parts * (1.0 + 16 * UNIT)
+    cost *= parts * (1.0 + gamma(16))
     size = parts * steep
     head[:, 0] += np.add.reduce(cost + parts * product.offset + size * product.rounding, axis=-2)
     head[:, 1] += np.add.reduce(cost + parts * product.middle + size * product.magnitude, axis=-2)

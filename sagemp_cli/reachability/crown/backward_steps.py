@@ -17,7 +17,6 @@ gain, the magnitude, and the coefficients of the variables before. Cells come fi
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -25,8 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine.form import SAFETY, AffineForm, Relaxed
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.reachability.affine.compiled.operations import Relaxed, Value
+from sagemp_cli.reachability.affine.compiled.steps import KeptStep
+from sagemp_cli.sets.rounding import SAFETY, TINY, at_least, gamma, slack
 
 Array = np.ndarray
 
@@ -121,26 +121,28 @@ class Step(NamedTuple):
     entries: tuple[int, ...]
 
 
-def compiled(steps: Sequence[AffineForm]) -> list[Step]:
+def ready(steps: Sequence[KeptStep]) -> list[Step]:
     """The recorded steps, ready for rows; equal structures are stacked, so that lines are found in one call for all."""
     parts: list[Step] = []
     for _, group in itertools.groupby(steps, key=_structure):
-        parts += _compile(list(group))
+        parts += _ready(list(group))
     return parts
 
 
-def _structure(after: AffineForm) -> Any:
+def _structure(step: KeptStep) -> Any:
     """Equal for steps that can be stacked."""
 
     def known(parameter: Any) -> Any:
         return ("tensor", id(parameter)) if isinstance(parameter, Tensor) else parameter
 
+    def how(r: Relaxed) -> Any:
+        if r.node is None or r.node.relaxation is None:
+            return None
+        return r.node.relaxation.operation, tuple(map(known, r.node.relaxation.parameters))
+
     return (
-        after.coefficients.shape,
-        tuple(
-            (r.name, r.first, r.coefficients.shape, r.error, r.operation, tuple(map(known, r.parameters)))
-            for r in after.frame.relaxations
-        ),
+        step.after.coefficients.shape,
+        tuple((r.name, r.first, r.form.coefficients.shape, r.form.error, how(r)) for r in step.relaxed),
     )
 
 
@@ -167,24 +169,25 @@ class _Stacked(NamedTuple):
     planes: dict[str, Tensor] | None = None
 
 
-def _compile(steps: list[AffineForm]) -> Iterator[Step]:
+def _ready(steps: list[KeptStep]) -> Iterator[Step]:
     """Steps of one structure."""
-    frame, count = steps[0].frame, len(steps)
-    n, cells = frame.states, math.prod(frame.batch)
-    radius = torch.stack([s.frame.disturbance_radius for s in steps])[:, None]
-    stacked = [_Stacked(n, frame.inputs, radius=radius)]
-    stacked += [_operation(list(group), cells) for group in zip(*(s.frame.relaxations for s in steps), strict=True)]
-    carried = torch.stack([s.rounding() for s in steps]).reshape(count, cells, n)
-    output = _signed(carried, _stack(steps, "magnitude", cells), _rows(steps, cells))
+    first, count = steps[0], len(steps)
+    cells, n, _ = first.ellipsoid.shape
+    own = first.own_radius
+    added = sum(r.radius.shape[-1] for r in first.relaxed)
+    radius = torch.from_numpy(own[: len(own) - added]).expand(count, 1, -1)
+    stacked = [_Stacked(n, n + radius.shape[-1], radius=radius)]
+    stacked += [_operation(list(group), cells) for group in zip(*(s.relaxed for s in steps), strict=True)]
+    _, magnitude, coefficients = _forms([s.after for s in steps], cells, n + len(own))
+    output = _signed(_stack([s.rounding for s in steps]), magnitude, coefficients)
     # Every product of a step is a sum of twice its entries, and what is no variable adds as many; 8 more for the
     # factors and for joining it to the rest.
     lengths = [4 * n + 8, *(4 * (s.last - s.first) + 8 for s in stacked)]
-    shape = torch.stack([s.frame.ellipsoid for s in steps]).reshape(count, cells, n, n)
-    kept = torch.ones(count, frame.size, dtype=torch.bool)
+    shape = _stack([s.ellipsoid for s in steps])
+    kept = torch.ones(count, n + len(own), dtype=torch.bool)
     for s in stacked:
         if s.kept is not None:
             kept[:, s.first : s.last] = s.kept
-    own = frame.own_radius(frame.size - n).numpy()[:, None]
     variables = _Variables(kept)
     outputs = variables.condensed(output)
     shared = [_equal_inputs(*pair) for pair in itertools.pairwise(stacked)]
@@ -198,8 +201,8 @@ def _compile(steps: list[AffineForm]) -> Iterator[Step]:
             outputs[k][:, variables.rows[k]],
             tuple(found for i, part in enumerate(parts) if (found := part.at(k, i - 1)) is not None),
             shapes[k],
-            own[variables.index[k][n:] - n],
-            sum(lengths) * UNIT * SAFETY,
+            own[variables.index[k][n:] - n, None],
+            gamma(sum(lengths)) * SAFETY,
             tuple(s.last - s.first for s in stacked[1:]),
         )
 
@@ -229,7 +232,7 @@ class _Variables:
         """Bound of what coefficients ``(steps, B, rows, first)`` have of no variables, ``(steps, B, rows)``."""
         first = coefficients.shape[-1]
         some = torch.where(self.kept[:, None, None, :first], 0.0, coefficients.abs())
-        return some.sum(-1) * (1.0 + 2 * (first + 4) * UNIT)
+        return some.sum(-1) * at_least(first)
 
 
 class _Part:
@@ -302,31 +305,23 @@ def _equal_inputs(a: _Stacked, b: _Stacked) -> Array | None:
 
 def _operation(group: list[Relaxed], cells: int) -> _Stacked:
     """One operation in all steps."""
-    r = group[0]
-    magnitude, radius = _stack(group, "magnitude", cells), _stack(group, "radius", cells)
-    last = r.first + radius.shape[-1]
-    if r.operation is None:
-        kept = _Stacked(r.first, last, radius=torch.ones_like(radius))
-        if r.factors is None:
-            return kept
+    r, radius = group[0], _stack([q.radius for q in group])
+    last, error = r.first + radius.shape[-1], r.form.error
+    center, magnitude, coefficients = _forms([q.form for q in group], cells, r.first)
+    if r.factors is not None:
         tilts, planes = _planes(group, cells, magnitude)
-        return kept._replace(inverse=1.0 / radius, tilts=tilts, planes=planes)
-    error, coefficients = r.error, _rows(group, cells)
-    missing = r.first - coefficients.shape[-1]
-    coefficients = torch.nn.functional.pad(coefficients, (0, missing))
-    center = _stack(group, "center", cells)
-    slope, offset, _ = (
-        torch.stack([q.band[part].expand(q.radius.shape) for q in group]).reshape(radius.shape) for part in range(3)
-    )
-    below, low, above, high = _lines(group, radius.shape)
+        level = torch.ones_like(radius)
+        return _Stacked(r.first, last, radius=level, inverse=1.0 / radius, tilts=tilts, planes=planes)
+    slope, offset = (_stack([q.band[part] for q in group]).expand(radius.shape) for part in range(2))
+    below, low, above, high = _lines(group)
     # The band's error as a function of x: what the input's own rounding does to it is in the last term.
-    own = (slope.abs() * magnitude + offset.abs() + radius) * ((error + 8 * UNIT) * SAFETY)
+    own = (slope.abs() * magnitude + offset.abs() + radius) * ((error + gamma(8)) * SAFETY)
 
     def relative(line_slope: Tensor, line_offset: Tensor, sign: float) -> tuple[Tensor, Tensor]:
         tilt = line_slope - slope
         value = tilt * center + (line_offset - offset)
-        doubt = tilt.abs() * magnitude * ((error + 8 * UNIT) * SAFETY)
-        doubt = doubt + (line_offset.abs() + offset.abs()) * (8 * UNIT) + own + TINY
+        doubt = tilt.abs() * magnitude * ((error + gamma(8)) * SAFETY)
+        doubt = doubt + slack(line_offset.abs() + offset.abs(), 8) + own + TINY
         tilt, value = (torch.where(torch.isfinite(value), part, 0.0) for part in (tilt, sign * value + doubt))
         return sign * tilt, torch.where(torch.isfinite(line_offset), value, radius)
 
@@ -351,11 +346,13 @@ def _planes(group: list[Relaxed], cells: int, magnitude: Tensor) -> tuple[Tensor
     """A product in all steps: tilts, and the other attributes of :class:`Product` by name."""
     r, factors = group[0], [q.factors for q in group]
     plus, minus, size, middle, carried = (
-        _stack(factors, name, cells) for name in ("plus", "minus", "size", "middle", "magnitude")
+        _stack([getattr(f, name) for f in factors]) for name in ("plus", "minus", "size", "middle", "magnitude")
     )
-    sums, differences = (_rows(factors, cells, name) for name in ("sum", "difference"))
+    sums, differences = (
+        _stack([getattr(f, name) for f in factors]).expand(-1, cells, -1, -1) for name in ("sum", "difference")
+    )
     tilts = torch.cat([differences, sums], dim=-2)
-    own = magnitude * ((2 * r.error + 24 * UNIT) * SAFETY)
+    own = magnitude * ((2 * r.form.error + gamma(24)) * SAFETY)
 
     def both(upper: Tensor, lower: Tensor) -> Tensor:
         return torch.cat([upper, lower], dim=-1)
@@ -368,16 +365,18 @@ def _planes(group: list[Relaxed], cells: int, magnitude: Tensor) -> tuple[Tensor
         "offset": both(own - middle, own + middle),
         "middle": both(middle.abs(), middle.abs()),
         "magnitude": both(carried, carried),
-        "rounding": both(carried, carried) * ((r.error + 8 * UNIT) * SAFETY),
+        "rounding": both(carried, carried) * ((r.form.error + gamma(8)) * SAFETY),
     }
 
 
-def _lines(group: list[Relaxed], shape: torch.Size) -> Iterator[Tensor]:
+def _lines(group: list[Relaxed]) -> Iterator[Tensor]:
     """The operation's lines in all steps, found in one call."""
-    r = group[0]
-    lower, upper = torch.stack([q.lower for q in group]), torch.stack([q.upper for q in group])
-    given = (torch.stack(parts) for parts in zip(*(q.given for q in group), strict=True))
-    return (part.reshape(shape) for part in r.operation.lines(lower, upper, *given, *r.parameters))
+    (r, *_) = group
+    assert r.node is not None and r.node.relaxation is not None
+    _, operation, parameters = r.node.relaxation
+    lower, upper = _stack([q.lower for q in group]), _stack([q.upper for q in group])
+    given = (_stack(parts) for parts in zip(*(q.given for q in group), strict=True))
+    return iter(operation.lines(lower, upper, *given, *parameters))
 
 
 def _signed(carried: Tensor, magnitude: Tensor, coefficients: Tensor) -> Tensor:
@@ -386,12 +385,14 @@ def _signed(carried: Tensor, magnitude: Tensor, coefficients: Tensor) -> Tensor:
     return torch.cat([torch.cat([lead, coefficients], dim=-1), torch.cat([lead, -coefficients], dim=-1)], dim=-2)
 
 
-def _stack(group: Sequence[Any], name: str, cells: int) -> Tensor:
-    """One attribute of all steps, ``(steps, B, entries)``."""
-    return torch.stack([getattr(q, name) for q in group]).reshape(len(group), cells, -1)
+def _stack(arrays: Sequence[Any]) -> Tensor:
+    """One array of all steps, ``(steps, B, ...)``."""
+    return torch.from_numpy(np.array(arrays))
 
 
-def _rows(group: Sequence[Any], cells: int, name: str = "coefficients") -> Tensor:
-    """Coefficients of all steps, ``(steps, B, entries, variables)``."""
-    stacked = torch.stack([getattr(q, name) for q in group], dim=1)
-    return stacked.reshape(stacked.shape[0], len(group), cells, -1).movedim(0, -1)
+def _forms(values: Sequence[Value], cells: int, variables: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres, magnitudes and coefficients of so many variables of all steps, ``(steps, B, entries, ...)``."""
+    both = _stack([v.both for v in values])
+    coefficients = _stack([v.coefficients for v in values])
+    missing = variables - coefficients.shape[-1]
+    return both[:, 0], both[:, 1], torch.nn.functional.pad(coefficients, (0, missing)).expand(-1, cells, -1, -1)

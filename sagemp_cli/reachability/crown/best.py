@@ -15,10 +15,11 @@ import torch
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.affine.form import Hints
-from sagemp_cli.reachability.batch import batched_start
+from sagemp_cli.reachability.affine.compiled.hints import Hints
+from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.blocks import in_blocks
 from sagemp_cli.reachability.crown.crown import Crown, cells_at_once, taken_back, taking_back
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 
@@ -47,14 +48,14 @@ class Best(Propagator):
     @torch.no_grad()
     def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none."""
-        start = batched_start(loop, start, disturbance)
+        known, start = recorded_and_batched(loop, start, disturbance)
 
-        def bounded(some: Loop, cells: Box) -> Reach:
+        def bounded(some: RecordedLoop, cells: Box) -> Reach:
             return self._bounded(some, cells, disturbance)
 
-        return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
+        return in_blocks(bounded, known, start, at_once=cells_at_once(self, known, start, disturbance))
 
-    def _bounded(self, loop: Loop, start: Box, disturbance: Box) -> Reach:
+    def _bounded(self, loop: RecordedLoop, start: Box, disturbance: Box) -> Reach:
         affine = Affine(symbols=self.symbols)
         hints: list[Hints] | None = None
         tubes: list[Tube] = []

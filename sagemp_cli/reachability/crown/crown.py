@@ -11,19 +11,23 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.reachability.affine.affine import Affine, AffineRun
-from sagemp_cli.reachability.affine.form import Hint, Hints, Relaxed, StepFrame
-from sagemp_cli.reachability.batch import batched_start
+from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints
+from sagemp_cli.reachability.affine.compiled.operations import Relaxed
+from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.blocks import in_blocks, some_of
 from sagemp_cli.reachability.crown.backward import backward
 from sagemp_cli.reachability.crown.steps import BLOCK, KEPT, MAKING, Steps
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
+from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.sets import Box, Tube
-from sagemp_cli.sets.rounding import UNIT
+from sagemp_cli.sets.rounding import slack
 
 AT_ONCE = 2**29
 """Bytes that cells which are bounded together may take; of one cell, if it takes more."""
@@ -51,13 +55,13 @@ class Crown(Propagator):
     @torch.no_grad()
     def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none."""
-        start = batched_start(loop, start, disturbance)
+        known, start = recorded_and_batched(loop, start, disturbance)
 
-        def bounded(some: Loop, cells: Box) -> Reach:
+        def bounded(some: RecordedLoop, cells: Box) -> Reach:
             run = Affine(symbols=self.symbols).run(some, cells, disturbance, keep_steps=True)
             return Reach(taken_back(run, cells, rows=self.rows)[0], notes=run.notes)
 
-        return in_blocks(bounded, loop, start, at_once=cells_at_once(self, loop, start, disturbance))
+        return in_blocks(bounded, known, start, at_once=cells_at_once(self, known, start, disturbance))
 
     def footprint(self, size: LoopSize) -> Footprint:
         """That of the forward pass, with ``2 K (v^2 + 2 n v)`` numbers for its steps; as much of the same made ready
@@ -77,7 +81,7 @@ def taking_back(symbols: int | None, rows: int, size: LoopSize) -> Footprint:
     return Footprint(forward.working + steps + ready + sweep, NUMBER * size.bounds)
 
 
-def cells_at_once(propagator: Propagator, loop: Loop, start: Box, disturbance: Box) -> int:
+def cells_at_once(propagator: Propagator, loop: RecordedLoop, start: Box, disturbance: Box) -> int:
     """Cells ``(..., n)`` that are bounded together, so that they take :data:`AT_ONCE` bytes; 1 at least."""
     batch = start.lower.shape[:-1]
     if batch.numel() == 1:
@@ -108,25 +112,28 @@ def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -
     for first in range(0, len(steps), size):
         some = run.steps[first : first + size]
         found = backward(steps, start.radius, targets=range(first, first + len(some)), inputs=inputs)
-        lower, upper = _placed(torch.stack([after.center for after in some], dim=-2), *found.state)
+        centers = torch.from_numpy(np.stack([step.after.both[0] for step in some], axis=1))
+        lower, upper = _placed(centers.reshape(found.state[0].shape), *found.state)
         lowers.append(lower)
         uppers.append(upper)
-        for after, bounds in zip(some, found.inputs, strict=True):
-            hints.append([_hint(after.frame, *pair) for pair in zip(after.frame.relaxations, bounds, strict=True)])
+        for step, bounds in zip(some, found.inputs, strict=True):
+            hints.append([_hint(*pair) for pair in zip(step.relaxed, bounds, strict=True)])
     return Tube(torch.cat(lowers, dim=-2), torch.cat(uppers, dim=-2)), hints
 
 
-def _hint(frame: StepFrame, operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> Hint:
-    """What is known of an operation, bounds of its input in its own shape."""
-    hint = Hint(operation.name, frame.entries(operation.center.shape), turn=operation.turn)
+def _hint(operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> Hint:
+    """What is known of an operation, bounds of its input ``(B, E)``."""
+    center = torch.from_numpy(operation.form.both[0])
+    turn = None if operation.turn is None else Turn(*map(torch.from_numpy, operation.turn))
+    hint = Hint(operation.name, operation.radius.shape[-1], turn=turn)
     if bounds is None:
         return hint
-    low, high = _placed(operation.center, *(side.reshape(operation.center.shape) for side in bounds))
+    low, high = _placed(center, *(side.reshape(center.shape) for side in bounds))
     return hint._replace(lower=low, upper=high)
 
 
 def _placed(center: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of deviations as bounds of values, rounded outwards; infinite where there is no centre."""
-    lower = center + low - (center.abs() + low.abs()) * (2 * UNIT)
-    upper = center + high + (center.abs() + high.abs()) * (2 * UNIT)
+    lower = center + low - slack(center.abs() + low.abs(), 2)
+    upper = center + high + slack(center.abs() + high.abs(), 2)
     return torch.nan_to_num(lower, nan=-math.inf), torch.nan_to_num(upper, nan=math.inf)

@@ -7,14 +7,13 @@ with a step costs far more than making it ready, so it may as well be made ready
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sagemp_cli.reachability.affine.form import AffineForm
-from sagemp_cli.reachability.crown.backward_steps import Step, compiled
+from sagemp_cli.reachability.affine.compiled.steps import KeptStep
+from sagemp_cli.reachability.crown.backward_steps import Step, ready
 from sagemp_cli.reachability.propagator import NUMBER
 
 KEPT = 2**27
@@ -67,9 +66,9 @@ class Steps:
         extents: of all steps.
     """
 
-    def __init__(self, recorded: Sequence[AffineForm]) -> None:
-        frame = recorded[0].frame
-        making = MAKING * NUMBER * max(1, math.prod(frame.batch)) * max(s.frame.size for s in recorded) ** 2
+    def __init__(self, recorded: Sequence[KeptStep]) -> None:
+        cells, n, _ = recorded[0].ellipsoid.shape
+        making = MAKING * NUMBER * max(1, cells) * max(n + len(s.own_radius) for s in recorded) ** 2
         self._recorded, self._length = recorded, max(1, BLOCK // making)
         self._kept: dict[int, list[Step]] = {}  # by block; the first ones, which every sweep comes by
         self._last = (-1, [])
@@ -93,7 +92,7 @@ class Steps:
         if self._last[0] != block:
             self._last = (-1, [])  # goes before the next one comes
             first = block * self._length
-            self._last = (block, compiled(self._recorded[first : first + self._length]))
+            self._last = (block, ready(self._recorded[first : first + self._length]))
         return self._last[1]
 
 

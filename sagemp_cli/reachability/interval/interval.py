@@ -11,9 +11,8 @@ from typing import ClassVar
 
 import torch
 
-import sagemp_cli.reachability.relaxations.registry  # noqa: F401  (registers the functions)
-from sagemp_cli.reachability.batch import batched_start
-from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.batch import recorded_and_batched
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 
@@ -28,14 +27,14 @@ class Interval(Propagator):
     @torch.no_grad()
     def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`; controls and recordings it has none."""
-        start = batched_start(loop, start, disturbance)
-        w_shape = (*start.lower.shape[:-1], disturbance.dim)
-        w = IntervalForm(disturbance.lower.expand(w_shape), disturbance.upper.expand(w_shape))
+        known, start = recorded_and_batched(loop, start, disturbance)
+        w = IntervalForm(disturbance.lower, disturbance.upper)
         lowers, uppers = [start.lower], [start.upper]
-        for k in range(loop.horizon):
-            lower, upper = loop.step(k, IntervalForm(lowers[-1], uppers[-1]), w).bounds()
-            lowers.append(lower)
-            uppers.append(upper)
+        for k in range(known.horizon):
+            numbers = IntervalForm(known.numbers[k], known.numbers[k])
+            after = known.program(k).run(IntervalForm(lowers[-1], uppers[-1]), w, numbers, evaluate=evaluate).next
+            lowers.append(after.lower.expand(start.lower.shape))
+            uppers.append(after.upper.expand(start.upper.shape))
         return Reach(Tube(torch.stack(lowers, dim=-2), torch.stack(uppers, dim=-2)))
 
     def footprint(self, size: LoopSize) -> Footprint:

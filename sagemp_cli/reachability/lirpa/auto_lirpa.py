@@ -12,8 +12,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import ConfigError, UsageError
-from sagemp_cli.loop.closed_loop import ClosedLoop, FoldedLoop
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.lirpa.adapter import METHODS, bound
 from sagemp_cli.reachability.propagator import Loop, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
@@ -56,32 +56,17 @@ class AutoLirpa(Propagator):
             UnsupportedOperationError: the loop uses an operation that auto_LiRPA cannot bound or bounds wrongly.
             UsageError: no usable auto_LiRPA is installed, or the boxes do not fit the loop.
         """
-        n = loop.state_dim
-        if start.dim != n or disturbance.lower.dim() != 1:
-            raise UsageError(
-                f"auto_lirpa: start must have shape (..., {n}) and disturbance (d,), "
-                f"found {tuple(start.lower.shape)} and {tuple(disturbance.lower.shape)}"
-            )
-        if isinstance(loop, ClosedLoop) and loop.folds:
-            loop = loop.folded()
-        if not isinstance(loop, ClosedLoop | FoldedLoop):
-            cells = Box(start.lower.reshape(-1, n), start.upper.reshape(-1, n))
-            low, high = self._cells(loop, cells, disturbance)
-            shape = (*start.lower.shape[:-1], -1, n)
-            return Reach(Tube(low.reshape(shape), high.reshape(shape)))
-        own = "biases" if isinstance(loop, FoldedLoop) else "references"
-        rows = getattr(loop, own).detach()
-        batch = torch.broadcast_shapes(rows.shape[:-2], start.lower.shape[:-1])
-        lower, upper = (corner.expand(*batch, n).reshape(-1, n) for corner in (start.lower, start.upper))
+        known, start = recorded_and_batched(loop, start, disturbance)
+        batch, n = start.lower.shape[:-1], start.dim
+        lower, upper = (corner.reshape(-1, n) for corner in (start.lower, start.upper))
         # Cells often come with a copy of their reference each: equal references make one call.
-        different, which = torch.unique(
-            rows.expand(*batch, *rows.shape[-2:]).reshape(-1, *rows.shape[-2:]), dim=0, return_inverse=True
-        )
-        low = torch.empty(len(which), loop.horizon + 1, n, dtype=torch.float64)
+        numbers = known.numbers_in(batch).detach().movedim(0, -2).reshape(len(lower), known.horizon, -1)
+        each, which = torch.unique(numbers.flatten(1), dim=0, return_inverse=True) if numbers.numel() else _one(lower)
+        low = torch.empty(len(lower), known.horizon + 1, n, dtype=torch.float64)
         high = torch.empty_like(low)
-        for r, part in enumerate(different):
+        for r in range(len(each)):
             mine = which == r
-            one = dataclasses.replace(loop, **{own: part})
+            one = dataclasses.replace(known, numbers=each[r].reshape(known.horizon, known.numbers.shape[-1]))
             low[mine], high[mine] = self._cells(one, Box(lower[mine], upper[mine]), disturbance)
         return Reach(Tube(low.reshape(*batch, -1, n), high.reshape(*batch, -1, n)))
 
@@ -116,3 +101,8 @@ class AutoLirpa(Propagator):
         cells = start.lower.shape[0]
         one = Box(disturbance.lower.expand(cells, -1), disturbance.upper.expand(cells, -1))
         return bound(unrolled, [start, *[one] * count], method=self.method)
+
+
+def _one(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps without numbers are one group."""
+    return torch.zeros(1, 0, dtype=torch.float64), torch.zeros(len(cells), dtype=torch.int64)

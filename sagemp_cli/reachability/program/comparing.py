@@ -8,17 +8,15 @@ points, not all: what is proved is proved of the program.
 from __future__ import annotations
 
 import itertools
-import math
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.program.probing import TOLERANCE, Step
-from sagemp_cli.reachability.program.program import Program
+from sagemp_cli.reachability.program.program import Instruction, Program
 from sagemp_cli.sets import Box
 
 ROUNDINGS = 16
@@ -52,7 +50,7 @@ def compare(step: Step, k: int, program: Program, x: Tensor, w: Tensor, after: T
     if not len(x):
         return
     with torch.no_grad():
-        low, high = program.run(IntervalForm(x, x), IntervalForm(w, w)).next.bounds()
+        low, high = program.run(IntervalForm(x, x), IntervalForm(w, w), evaluate=evaluate).next.bounds
         slack = ROUNDINGS * ((high - low) + 2.0**-52 * after.abs())
         off = (after < low - slack) | (after > high + slack)
         loose = ~torch.isfinite(slack)
@@ -101,32 +99,14 @@ def corners_and_centres(cells: Box, disturbance: Box, *, most: int) -> tuple[Ten
     return torch.cat([both.center, corners]).split([cells.dim, disturbance.dim], dim=-1)
 
 
-class _Kinks(TorchFunctionMode):
-    """Notes how far values are from where the functions that have kinks have them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.gaps: list[Tensor] = []
-
-    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = function(*args, **(kwargs or {}))
-        for gap in _gaps(getattr(function, "__name__", ""), *args, **(kwargs or {})):
-            if isinstance(gap, Tensor) and gap.requires_grad:
-                self.gaps.append(gap)
-        return result
-
-
-def _gaps(name: str, x: Any = None, *args: Any, **kwargs: Any) -> list[Any]:
-    if not isinstance(x, Tensor) or not x.is_floating_point():
-        return []
-    if name in ("relu", "leaky_relu", "abs", "absolute", "elu", "__abs__"):
-        return [x]
-    if name in ("maximum", "minimum", "fmax", "fmin", "max", "min") and args:
-        return [x - args[0]]
-    if name in ("clamp", "clip", "clamp_min", "clamp_max", "hardtanh", "relu6"):
-        limits = (0.0, 6.0) if name == "relu6" else (*args, *kwargs.values()) or (-1.0, 1.0)
-        return [x - v for v in limits if isinstance(v, Tensor) or (type(v) in (int, float) and math.isfinite(v))]
-    return []
+def _gaps(i: Instruction, values: Sequence[Tensor]) -> list[Tensor]:
+    """How far values are from where an instruction has its kinks."""
+    if i.kind in ("relu", "leaky_relu", "abs", "elu"):
+        return [values[0]]
+    if i.kind in ("maximum", "minimum"):
+        return [values[0] - values[1]]
+    limits = i.constants if i.kind == "clamp" else ()
+    return [values[0][..., finite] - limit[finite] for limit in limits if (finite := torch.isfinite(limit)).any()]
 
 
 def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
@@ -138,9 +118,14 @@ def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, 
     sizes = [start.dim, disturbance.dim]
 
     def gaps(z: Tensor) -> Tensor | None:
-        with torch.enable_grad(), _Kinks() as kinks:
-            program.run(*z.split(sizes, dim=-1))
-        found = [g.reshape(len(z), -1) for g in kinks.gaps if g.shape[:1] == z.shape[:1]]
+        found: list[Tensor] = []
+
+        def noted(i: Instruction, values: Sequence[Tensor]) -> Tensor:
+            found.extend(gap for gap in _gaps(i, values) if gap.requires_grad)
+            return i.on(*values)
+
+        with torch.enable_grad():
+            program.run(*z.split(sizes, dim=-1), evaluate=noted)
         return torch.cat(found, -1) if found else None
 
     z = both.sample(_STARTS, torch.Generator().manual_seed(3)).requires_grad_(True)

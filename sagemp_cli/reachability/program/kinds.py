@@ -66,16 +66,15 @@ KINDS = (*INPUTS, "constant", "pick", "join", "linear", *OF_TWO, *OF_ONE)
 """All of them."""
 
 
-def pick(value: Any, entries: Sequence[int]) -> Any:
+def pick(value: Tensor, entries: Sequence[int]) -> Tensor:
     """Entries of a vector; neighbours as a slice, which costs nothing."""
     first, stop = entries[0], entries[0] + len(entries)
     if tuple(entries) == tuple(range(first, stop)):
         return value[..., first:stop]
-    index = torch.tensor(entries)
-    return value.index_select(-1, index) if isinstance(value, Tensor) else value[..., index]
+    return value.index_select(-1, torch.tensor(entries))
 
 
-def join(parts: Sequence[Any]) -> Any:
+def join(parts: Sequence[Tensor]) -> Tensor:
     """Vectors one after the other; those without a batch are repeated for the batch of the others."""
     batch = max((p.shape[:-1] for p in parts), key=len)
     return torch.cat([p if len(p.shape) > len(batch) else p.expand(*batch, p.shape[-1]) for p in parts], dim=-1)

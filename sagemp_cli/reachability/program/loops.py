@@ -41,6 +41,13 @@ class RecordedLoop:
         """Shape of the batch of loops that this is."""
         return self.numbers.shape[1:-1]
 
+    def numbers_in(self, batch: torch.Size) -> Tensor:
+        """The numbers of all steps for a batch that the loop's own broadcasts to, ``(K, *batch, g)``."""
+        own = self.batch
+        between = (1,) * (len(batch) - len(own))
+        numbers = self.numbers.reshape(self.horizon, *between, *own, self.numbers.shape[-1])
+        return numbers.expand(self.horizon, *batch, -1)
+
     def program(self, k: int) -> Program:
         """Of step k."""
         return self.programs[k if len(self.programs) > 1 else 0]
@@ -57,7 +64,7 @@ class RecordedLoop:
 def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
     """The loop as programs; one that is recorded already as it is.
 
-    A loop that says what its steps have of their own (``given``, ``step_given``) is one program, with that as the
+    A loop that says what its steps have of their own (``numbers``, ``step_given``) is one program, with that as the
     step's numbers. Of any other every step is recorded by itself; steps that turn out to be the same are one program.
 
     Args:
@@ -73,10 +80,9 @@ def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
     steps = loop.horizon
     x, w = start.center.reshape(-1, start.dim)[0], disturbance.center.reshape(-1, disturbance.dim)[0]
     if _says_its_steps(loop):
-        given = torch.stack([loop.given(k) for k in range(steps)]).to(torch.float64)
-        shape = given.shape[given.dim() - loop.given_dim :]
-        numbers = given.reshape(*given.shape[: given.dim() - loop.given_dim], -1)
-        program = record(lambda x, w, p: loop.step_given(p.reshape(shape), x, w), x, w, numbers.flatten(0, -2)[0])
+        numbers = loop.numbers().to(torch.float64)
+        example = numbers.flatten(0, -2)[0]
+        program = record(lambda x, w, numbers: loop.step_given(numbers, x, w), x, w, example)
         return RecordedLoop((program,), numbers, steps)
     programs = [record(lambda x, w, k=k: loop.step(k, x, w), x, w) for k in range(steps)]
     if all(programs[0].same_as(other) for other in programs[1:]):

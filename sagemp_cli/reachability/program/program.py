@@ -37,7 +37,7 @@ class Instruction:
     entries: tuple[int, ...] = ()
 
     def on(self, *operands: Any) -> Any:
-        """The result on tensors (and whatever answers torch's functions), from the operands' values ``(..., size)``."""
+        """The result on tensors, from the operands' values ``(..., size)``."""
         if self.kind == "constant":
             return self.constants[0]
         if self.kind == "pick":
@@ -146,9 +146,8 @@ class Program:
             values.append(instruction.on(*operands) if evaluate is None else evaluate(instruction, operands))
         outputs = self.outputs.of(values)
         after = outputs.next
-        if evaluate is None and isinstance(after, Tensor) and after.dim() < len(state.shape):  # a constant has no batch
-            after = after.expand(state.shape) if isinstance(state, Tensor) else state * 0.0 + after
-            return replace(outputs, next=after)
+        if evaluate is None and after.dim() < state.dim():  # a constant has no batch
+            return replace(outputs, next=after.expand(state.shape))
         return outputs
 
     def same_as(self, other: Program) -> bool:
@@ -175,6 +174,8 @@ def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str 
         return "must be among the first, in the order state, disturbance, numbers"
     if any(not 0 <= o < slot for o in i.operands):
         return f"reads slots {list(i.operands)}, allowed are earlier ones"
+    if i.kind not in (*INPUTS, "constant") and all(before[o].kind == "constant" for o in i.operands):
+        return "reads constants only, which are one constant"
     sizes = [before[o].size for o in i.operands]
     count = {"pick": 1, "linear": 1, "join": max(len(sizes), 1)}.get(
         i.kind, (i.kind in OF_ONE) + 2 * (i.kind in OF_TWO)

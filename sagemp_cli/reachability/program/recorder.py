@@ -44,10 +44,9 @@ class Recorder:
         self._instructions: list[Instruction] = []
         self._starts: list[int] = []
         self._size = 0
-        # Of every id: the example's number, the instruction that makes it, and whether it is a constant.
-        self._table = torch.zeros(0, dtype=torch.float64)
-        self._owner = torch.zeros(0, dtype=torch.int64)
-        self._fixed = torch.zeros(0, dtype=torch.bool)
+        self._table = torch.zeros(0, dtype=torch.float64)  # of each id: the example's number
+        self._owner = torch.zeros(0, dtype=torch.int64)  # the instruction that made it
+        self._fixed = torch.zeros(0, dtype=torch.bool)  # and whether that is a constant
         self._slots: dict[Any, int] = {}
         self._examples: list[Tensor] = []
         self.constant(torch.zeros(1, dtype=torch.float64))
@@ -74,7 +73,7 @@ class Recorder:
 
     def example(self, ids: Tensor) -> Tensor:
         """The numbers of the example, in the shape and strides of the ids; NaN where nothing was written."""
-        return torch.where(ids < 0, torch.nan, self._table[ids.clamp(min=0)])
+        return self._table[ids]  # -1 is the last entry
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
@@ -88,7 +87,7 @@ class Recorder:
         if self.is_constant(flat):
             return self._constants(flat[:1] if alone else flat)
         if alone:
-            return Slot(self._gathered([(int(self._owners(flat[:1])), flat[:1])]))
+            return Slot(self._gathered([(int(self._owner[flat[0]]), flat[:1])]))
         runs = self._runs(flat)
         if len(runs) <= 2 * len({owner for owner, _ in runs}):
             return Slot(self._gathered(runs))
@@ -118,7 +117,7 @@ class Recorder:
         for name, ids in outputs.items():
             operand = None if ids is None else self.operand(ids, full=True)
             slots[name] = self._constant_slot(operand) if isinstance(operand, Tensor) else operand and operand.index
-        inputs = {int(self._owners(ids[:1])) for ids in (self.state, self.disturbance, self.numbers) if len(ids)}
+        inputs = {int(self._owner[ids[0]]) for ids in (self.state, self.disturbance, self.numbers) if len(ids)}
         needed, pending = set(inputs), [slot for slot in slots.values() if slot is not None]
         while pending:
             slot = pending.pop()
@@ -144,18 +143,15 @@ class Recorder:
         self._instructions.append(instruction)
         self._starts.append(start)
         self._examples.append(example.detach())
-        if self._size > len(self._table):
-            more = max(self._size - len(self._table), 1024)
-            self._table, self._owner, self._fixed = (
-                torch.cat([t, t.new_zeros(more)]) for t in (self._table, self._owner, self._fixed)
-            )
+        if self._size >= len(self._table):  # there is always a last entry, which is no number
+            more = max(self._size + 1 - len(self._table), 1024)
+            self._table = torch.cat([self._table, self._table.new_full((more,), torch.nan)])
+            self._owner = torch.cat([self._owner, self._owner.new_zeros(more)])
+            self._fixed = torch.cat([self._fixed, self._fixed.new_zeros(more)])
         self._table[start : self._size] = example.detach()
         self._owner[start : self._size] = len(self._instructions) - 1
         self._fixed[start : self._size] = instruction.kind == "constant"
         return torch.arange(start, self._size)
-
-    def _owners(self, ids: Tensor) -> Tensor:
-        return self._owner[ids]
 
     def _check_written(self, ids: Tensor) -> None:
         if ids.numel() and int(ids.min()) < 0:
@@ -165,8 +161,7 @@ class Recorder:
 
     def _runs(self, ids: Tensor) -> list[tuple[int, Tensor]]:
         """Neighbours that one instruction made, with its number."""
-        owners = self._owners(ids)
-        kinds, counts = torch.unique_consecutive(owners, return_counts=True)
+        kinds, counts = torch.unique_consecutive(self._owner[ids], return_counts=True)
         return list(zip(kinds.tolist(), ids.split(counts.tolist()), strict=True))
 
     def _constants(self, ids: Tensor) -> Tensor:

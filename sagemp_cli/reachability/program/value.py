@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
-from sagemp_cli.reachability.form import unsupported
 from sagemp_cli.reachability.program.memory import Example
 from sagemp_cli.reachability.program.recorder import Recorder
 
@@ -29,6 +28,14 @@ _CLAMPS = ("clamp", "clip", "clamp_min", "clamp_max", "maximum", "minimum", "fma
 
 _RESHAPES = ("t_", "transpose_", "swapaxes_", "swapdims_", "squeeze_", "unsqueeze_", "resize_", "resize_as_", "set_")
 """Methods that change a tensor's shape and not its entries."""
+
+
+def unsupported(name: str) -> UnsupportedOperationError:
+    """The error for a torch operation that nothing is known of."""
+    return UnsupportedOperationError(
+        f"torch operation '{name}' has no relaxation in the native propagators (affine, crown, interval); "
+        f"add one in sagemp_cli/reachability/relaxations and register it in its registry.py"
+    )
 
 
 def exact(value: Any, *, operation: str) -> Tensor:

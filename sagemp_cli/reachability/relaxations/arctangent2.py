@@ -23,7 +23,7 @@ from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import Excess
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, gamma, slack
 
 WHOLE = math.pi * (1.0 + 2.0**-50)
 """Bound of all angles."""
@@ -78,7 +78,7 @@ def band(lower: Tensor, upper: Tensor, *along: Tensor) -> Band:
     best = _level(known)
     for slope in (_chord(lower, upper, known).detach(), _best(lower, upper, known, pieces.radius_objective)):
         found = _excess(slope, lower, upper, known)
-        radius = 0.5 * (found.most - found.least) + (abs(found.most) + abs(found.least)) * (2 * UNIT)
+        radius = 0.5 * (found.most - found.least) + slack(abs(found.most) + abs(found.least), 2)
         offset = 0.5 * (found.most + found.least)
         better = torch.isfinite(slope) & (radius < _BETTER * best.radius)  # no number is not better
         best = Band(*(torch.where(better, *pair) for pair in zip((slope, offset, radius), best, strict=True)))
@@ -115,14 +115,14 @@ def twist(v: Tensor, radius: Tensor, plus: Tensor, minus: Tensor) -> tuple[Tenso
         plus, minus: bounds of ``|P|`` and ``|M|`` for ``P = l X + Y / l`` and ``M = l X - Y / l``, for any l > 0.
     """
     shift = abs(v) * radius
-    growth = 1.0 + 8 * UNIT
+    growth = 1.0 + gamma(8)
     return -(0.25 * minus * minus + shift) * growth - TINY, (0.25 * plus * plus + shift) * growth + TINY
 
 
 def _level(known: Along) -> Band:
     """The band that has no slope."""
     zero = torch.zeros_like(known.low)
-    return Band(zero, 0.5 * (known.low + known.high), 0.5 * (known.high - known.low) + 8 * math.pi * UNIT)
+    return Band(zero, 0.5 * (known.low + known.high), 0.5 * (known.high - known.low) + slack(math.pi, 8))
 
 
 @torch.no_grad()
@@ -163,7 +163,7 @@ def _excess(slope: Tensor, lower: Tensor, upper: Tensor, known: Along) -> Excess
     angle, nothing = known.angle, torch.full_like(slope, math.inf)
     holds = (least > 0) & (angle - known.low < _ALONE) & (known.high - angle < _ALONE)
     holds = holds & torch.isfinite(most) & torch.isfinite(slope)
-    doubt = (angle.abs() + found.least.abs() + found.most.abs() + 1.0) * (16 * UNIT)
+    doubt = slack(angle.abs() + found.least.abs() + found.most.abs() + 1.0, 16)
     least, most = found.least + angle - doubt, found.most + angle + doubt
     return found._replace(least=torch.where(holds, least, -nothing), most=torch.where(holds, most, nothing))
 
@@ -174,11 +174,11 @@ def _at_end(slope: Tensor, lower: Tensor, upper: Tensor, u: Tensor) -> Excess:
     The ends of t are rounded outwards, and what ``slope u`` as computed is off by is paid for.
     """
     ends = torch.stack([lower / u, upper / u])
-    margin = ends.abs() * (2 * UNIT) + TINY
+    margin = slack(ends.abs(), 2) + TINY
     ends = torch.stack([ends[0] - margin[0], ends[1] + margin[1]])
     steep = slope * u
     found = pieces.excess(arctangent.CURVE, steep, ends, torch.atan(ends))
-    doubt = (steep.abs() * ends.abs().amax(0) + 1.0) * (4 * UNIT)
+    doubt = slack(steep.abs() * ends.abs().amax(0) + 1.0, 4)
     return Excess(found.least - doubt, found.most + doubt, found.lowest * u, found.highest * u)
 
 
@@ -190,14 +190,14 @@ def _twisted(slope: Tensor, lower: Tensor, upper: Tensor, known: Along) -> Exces
     """
     u = torch.stack([known.least, known.most])
     ends = torch.stack([(lower / u).amin(0), (upper / u).amax(0)])
-    margin = ends.abs() * (2 * UNIT) + TINY
+    margin = slack(ends.abs(), 2) + TINY
     ends = torch.stack([ends[0] - margin[0], ends[1] + margin[1]])
     steep = slope * known.middle
     found = pieces.excess(arctangent.CURVE, steep, ends, torch.atan(ends))
-    share = slope.abs() / known.least * (1.0 + 16 * UNIT)
+    share = slope.abs() / known.least * (1.0 + gamma(16))
     twists = torch.stack([known.twist_low * share, known.twist_high * share])
     twists = torch.where(slope >= 0, twists, -twists.flip(0))
-    doubt = (steep.abs() * (ends.abs().amax(0) + 1.0) + 1.0) * (8 * UNIT)
+    doubt = slack(steep.abs() * (ends.abs().amax(0) + 1.0) + 1.0, 8)
     middle = known.middle
     return Excess(
         found.least - twists[1] - doubt, found.most - twists[0] + doubt, found.lowest * middle, found.highest * middle

@@ -14,7 +14,7 @@ from torch import Tensor
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, slack
 
 
 def band(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor) -> Band:
@@ -23,7 +23,7 @@ def band(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float |
     rise_left, rise_right = _slopes(points, values)
     slope = torch.minimum(rise_left, rise_right)
     least, most = _extremes(slope, points, values)
-    radius = 0.5 * (most - least) + (most.abs() + least.abs()) * (2 * UNIT) + 0.0 * (lower + upper)
+    radius = 0.5 * (most - least) + slack(most.abs() + least.abs(), 2) + 0.0 * (lower + upper)
     return settled(slope, 0.5 * (most + least), radius)
 
 
@@ -72,5 +72,5 @@ def _extremes(slope: Tensor, points: Tensor, values: Tensor) -> tuple[Tensor, Te
     """Bounds of the excess, rounding included."""
     tilted = slope * points
     excess = values - tilted
-    margin = (values.abs() + tilted.abs()) * (4 * UNIT) + TINY
+    margin = slack(values.abs() + tilted.abs(), 4) + TINY
     return (excess - margin).amin(0), (excess + margin).amax(0)

@@ -10,7 +10,7 @@ from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.value_range import increasing, outward
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, gamma
 
 
 def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None = None) -> Band:
@@ -20,10 +20,10 @@ def band(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | No
     ``max((s - a) lower, (1 - a) upper)`` (at the ends), so the band is exact up to rounding, whatever ``a``.
     """
     slope, gap = _chord_and_gap(lower, upper, negative_slope, slope)
-    # Two roundings in the gap and one in the half: 4 UNIT; an upper bound of the gap gives an upper bound of both
+    # Two roundings in the gap and one in the half; an upper bound of the gap gives an upper bound of both
     # halves.
 
-    half = gap * (0.5 + 4 * UNIT)
+    half = gap * (0.5 + gamma(4))
     return settled(slope, half, half)
 
 
@@ -33,7 +33,7 @@ def lines(lower: Tensor, upper: Tensor, negative_slope: float) -> Lines:
     one = torch.ones_like(slope)
     below = torch.where(upper >= -lower, one, negative_slope * one)
     below = torch.where((lower >= 0) | (upper <= 0), slope, below)
-    return _lines.settled(Lines(below, torch.zeros_like(slope), slope, gap * (1.0 + 4 * UNIT)))
+    return _lines.settled(Lines(below, torch.zeros_like(slope), slope, gap * (1.0 + gamma(4))))
 
 
 def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations.band import Band
-from sagemp_cli.sets.rounding import UNIT
+from sagemp_cli.sets.rounding import slack
 
 
 class Lines(NamedTuple):
@@ -28,7 +28,7 @@ class Lines(NamedTuple):
 def parallel(band: Band) -> Lines:
     """The two edges of a band: lines for any function that has a band."""
     slope, offset, radius = band
-    margin = radius + (offset.abs() + radius) * (4 * UNIT)
+    margin = radius + slack(offset.abs() + radius, 4)
     return Lines(slope, offset - margin, slope, offset + margin)
 
 

@@ -30,7 +30,7 @@ from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.lines import Lines
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, gamma, slack
 
 _GOOD = 2e-4  # a slope whose objective is this close to the best, in units of the excess's range, is not refined
 
@@ -78,7 +78,7 @@ class Curve:
     @property
     def margin(self) -> float:
         """Relative error of ``f(x) - a x`` as computed: of f, of the product and of the difference."""
-        return (2 * self.ulps + 4) * UNIT
+        return gamma(2 * self.ulps + 4)
 
 
 class Excess(NamedTuple):
@@ -107,7 +107,7 @@ def band(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None =
     if crossing is not None and bool(crossing.any()):
         slope = m.where(crossing, _searched(curve, ends, values, radius_objective), slope)
     found = excess(curve, slope, ends, values)
-    radius = 0.5 * (found.most - found.least) + (abs(found.most) + abs(found.least)) * (2 * UNIT) + outside
+    radius = 0.5 * (found.most - found.least) + slack(abs(found.most) + abs(found.least), 2) + outside
     return settled(slope, 0.5 * (found.most + found.least), radius)
 
 

@@ -31,7 +31,7 @@ from sagemp_cli.reachability.relaxations.pieces import (
     radius_objective,
     upper_objective,
 )
-from sagemp_cli.sets.rounding import UNIT
+from sagemp_cli.sets.rounding import slack
 
 ULPS = 4
 """Margin for torch's and numpy's ``sin, cos, acos, asin``, in ulps of 1; tested against ball arithmetic."""
@@ -191,7 +191,7 @@ def _margin(size: Tensor) -> Tensor:
     The values by ULPS ulps of 1, ``slope * x`` and the difference by 4 roundings, and the argument of the extrema by
     a few ulps of x (times ``|slope| <= 1``; the excess is flat there). The rounding of the offset is in it as well.
     """
-    return (size + 8.0) * ((16 + 4 * ULPS) * UNIT)
+    return slack(size + 8.0, 16 + 4 * ULPS)
 
 
 def _chord(wave: _Wave, lower: Tensor, upper: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
 from sagemp_cli.reachability.relaxations.value_range import increasing
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, gamma, slack
 
 ULPS = 4
 """Margin for the formulas below, in ulps of the result; tested against ball arithmetic."""
@@ -33,7 +33,7 @@ def _derivative(z: Tensor) -> Tensor:
 
 
 def _touch(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    a = slope.clamp(1e-300, 1.0 - UNIT)
+    a = slope.clamp(1e-300, 1.0 - gamma(1))
     return torch.log(a / (1.0 - a))
 
 
@@ -47,7 +47,7 @@ def band(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20.
     slope, offset, radius = pieces.band(CURVE, z_lower, z_upper)
     half = 0.5 * _jump(z_upper, threshold)
     offset, radius = (offset - half) / beta, (radius + half) / beta
-    return settled(slope, offset, radius + (offset.abs() + radius) * (8 * UNIT) + TINY)
+    return settled(slope, offset, radius + slack(offset.abs() + radius, 8) + TINY)
 
 
 def lines(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Lines:
@@ -56,7 +56,7 @@ def lines(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20
     a, low, b, high = pieces.lines(CURVE, z_lower, z_upper)
     jump = _jump(z_upper, threshold)
     low, high = (low - jump) / beta, high / beta
-    return Lines(a, low - (low.abs() + jump) * (8 * UNIT) - TINY, b, high + high.abs() * (8 * UNIT) + TINY)
+    return Lines(a, low - slack(low.abs() + jump, 8) - TINY, b, high + slack(high.abs(), 8) + TINY)
 
 
 def value_range(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: float = 20.0) -> tuple[Tensor, Tensor]:
@@ -64,8 +64,8 @@ def value_range(lower: Tensor, upper: Tensor, beta: float = 1.0, threshold: floa
     z_lower, z_upper = _scaled(lower, upper, beta)
     low, high = increasing(_value, z_lower, z_upper, ulps=ULPS)
     return (
-        ((low - _jump(z_upper, threshold)) / beta - low.abs() / beta * (8 * UNIT) - TINY).clamp(min=0.0),
-        high / beta * (1 + 8 * UNIT) + TINY,
+        ((low - _jump(z_upper, threshold)) / beta - slack(low.abs() / beta, 8) - TINY).clamp(min=0.0),
+        high / beta * (1 + gamma(8)) + TINY,
     )
 
 
@@ -74,10 +74,10 @@ def _scaled(lower: Tensor, upper: Tensor, beta: float) -> tuple[Tensor, Tensor]:
     if beta == 1:
         return lower, upper
     low, high = beta * lower, beta * upper
-    return low - (low.abs() * (2 * UNIT) + TINY), high + (high.abs() * (2 * UNIT) + TINY)
+    return low - (slack(low.abs(), 2) + TINY), high + (slack(high.abs(), 2) + TINY)
 
 
 def _jump(z_upper: Tensor, threshold: float) -> Tensor:
     """How far torch's function may lie below the smooth one."""
     jump = math.log1p(math.exp(-threshold)) * (1 + 1e-12)
-    return (z_upper * (1 + 8 * UNIT) > threshold).to(z_upper) * jump
+    return (z_upper * (1 + gamma(8)) > threshold).to(z_upper) * jump

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import TINY, gamma
 
 
 def outward(least: Tensor, most: Tensor, *, ulps: float, floor: float = -math.inf) -> tuple[Tensor, Tensor]:
@@ -16,7 +16,7 @@ def outward(least: Tensor, most: Tensor, *, ulps: float, floor: float = -math.in
 
     But not below the floor, a bound of all values: the domains of roots and quotients begin at 0 exactly.
     """
-    margin = (2 * ulps + 1) * UNIT
+    margin = gamma(2 * ulps + 1)
     low = torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
     high = torch.nan_to_num(most + (most.abs() * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf)
     return low.clamp(min=floor), high

@@ -1,47 +1,19 @@
-"""The forward pass on arrays against the one on tensors, operation by operation, which knows nothing of it."""
+"""The forward pass: on arrays and on tensors, against rollouts."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+import dataclasses
 
 import pytest
 import torch
 
-from sagemp_cli.reachability.affine import affine
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.affine.compiled import operations as planned_operations
-from sagemp_cli.reachability.affine.compiled import run as planned_run
-from sagemp_cli.reachability.affine.compiled.foldable_loop import NotFoldable
+from sagemp_cli.reachability.affine.compiled.operations import Frame
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.partition import partition
+from sagemp_cli.sets.zonotope import Zonotope
 
 from ..propagator_cases import DISTURBANCE, START, AffineLoop, EveryOperation, line, rollouts, unicycle_loop
-
-
-@dataclass(frozen=True)
-class Given:
-    """A loop whose steps differ by their number, told so."""
-
-    loop: Any
-    given_dim: ClassVar[int] = 1
-
-    @property
-    def horizon(self):
-        return self.loop.horizon
-
-    @property
-    def state_dim(self):
-        return self.loop.state_dim
-
-    def given(self, k):
-        return torch.tensor([float(k)], dtype=torch.float64)
-
-    def step_given(self, given, x, w):
-        return self.loop.step(given, x, w), None
-
-    def step(self, k, x, w):
-        return self.step_given(self.given(k), x, w)[0]
 
 
 class Quotients:
@@ -59,76 +31,77 @@ class Angles:
         return 0.5 * torch.atan2(x, 2.0 + w) + 0.1 * torch.atan2(x[..., :1], x - 3.0)
 
 
-class FromTheFront:
-    horizon, state_dim = 4, 2
-
-    def step(self, k, x, w):
-        a, b = x.unbind(x.dim() - 1)  # counted from the front, where a batch may be
-        return 0.5 * torch.sin(torch.stack([a + b, b], dim=-1)) + w
-
-
 NOISE = Box.around([0.05, 0.0, 0.0], [0.1] * 3)
 LOOPS = {
     "unicycle": (unicycle_loop(line(0.1)), START, DISTURBANCE),
-    "unicycle, folded": (unicycle_loop(line(0.1)).folded(), START, DISTURBANCE),
     "two references": (unicycle_loop(line(0.1), line(-0.2)), partition(START, [2, 2, 1, 1]), DISTURBANCE),
-    "every operation": (Given(EveryOperation()), Box.around([0.2, -0.1, 0.4], [0.3] * 3), NOISE),
-    "every operation, wide": (Given(EveryOperation()), Box.around([0.1, -0.05, 0.03], [1.2] * 3), NOISE),
-    "angles": (Given(Angles()), Box.around([0.5, 0.2], [0.1, 0.2]), Box.around([0.0] * 2, [0.1] * 2)),
-    "quotients": (Given(Quotients()), Box.around([0.2, 0.1], [0.3, 0.5]), Box.around([0.0] * 2, [0.1] * 2)),
-    "numbers": (Given(AffineLoop()), Box.around([0.0, 1.0], [0.1, 0.2]), Box.around([0.1, 0.0], [0.05, 0.02])),
+    "every operation": (EveryOperation(), Box.around([0.2, -0.1, 0.4], [0.3] * 3), NOISE),
+    "every operation, wide": (EveryOperation(), Box.around([0.1, -0.05, 0.03], [1.2] * 3), NOISE),
+    "angles": (Angles(), Box.around([0.5, 0.2], [0.1, 0.2]), Box.around([0.0] * 2, [0.1] * 2)),
+    "quotients": (Quotients(), Box.around([0.2, 0.1], [0.3, 0.5]), Box.around([0.0] * 2, [0.1] * 2)),
+    "numbers": (AffineLoop(), Box.around([0.0, 1.0], [0.1, 0.2]), Box.around([0.1, 0.0], [0.05, 0.02])),
 }
 
 
-@pytest.fixture
-def one_by_one(monkeypatch):
-    """Switches the forward pass on arrays off."""
-
-    def refuse(*_, **__):
-        raise NotFoldable
-
-    return lambda: monkeypatch.setattr(affine, "planned_run", refuse)
+@pytest.mark.parametrize("symbols", [None, 25])
+@pytest.mark.parametrize("name", LOOPS)
+def test_tensors_give_the_tube_that_arrays_give(name, symbols):
+    loop, start, disturbance = LOOPS[name]
+    if name == "two references":
+        start = Box(start.lower.expand(2, -1, -1), start.upper.expand(2, -1, -1))
+    arrays = Affine(symbols=symbols).run(loop, start, disturbance)
+    wanted = Box(start.lower.clone().requires_grad_(True), start.upper)
+    tensors = Affine(symbols=symbols).run(loop, wanted, disturbance)
+    assert tensors.tube.lower.requires_grad and not arrays.tube.lower.requires_grad
+    width = float(arrays.tube.width.max())
+    for found, expected in ((tensors.tube.lower, arrays.tube.lower), (tensors.tube.upper, arrays.tube.upper)):
+        torch.testing.assert_close(found.detach(), expected, rtol=1e-8, atol=1e-8 * width)
+    for mine, other in zip(arrays.bands, tensors.bands, strict=True):
+        assert [name for name, _ in mine] == [name for name, _ in other]
 
 
 @pytest.mark.parametrize("propagator", [Affine(), Affine(symbols=25), Crown(), Best()], ids=str)
 @pytest.mark.parametrize("name", LOOPS)
-def test_the_tube_is_that_of_the_pass_on_tensors(name, propagator, one_by_one, monkeypatch):
+def test_the_tube_holds_the_rollouts(name, propagator):
     loop, start, disturbance = LOOPS[name]
-    start = Box(*torch.broadcast_tensors(start.lower, start.upper))
     if name == "two references":
-        start = Box(start.lower.expand(2, -1, -1), start.upper.expand(2, -1, -1))
-    calls = []
-    honest = planned_run._Prepared
-    monkeypatch.setattr(planned_run, "_Prepared", lambda *args: calls.append(0) or honest(*args))
-    found = propagator.propagate(loop, start, disturbance)
-    assert calls
-    one_by_one()
-    calls.clear()
-    expected = propagator.propagate(loop, start, disturbance)
-    assert not calls and found.lower.shape == expected.lower.shape
-    width = expected.width.max()
-    torch.testing.assert_close(found.lower, expected.lower, rtol=1e-8, atol=1e-8 * float(width))
-    torch.testing.assert_close(found.upper, expected.upper, rtol=1e-8, atol=1e-8 * float(width))
+        return
+    tube, states = propagator.propagate(loop, start, disturbance), rollouts(loop, start, disturbance)
+    assert bool(((tube.lower <= states) & (states <= tube.upper)).all())
 
 
-def test_the_record_and_the_controls_are_those_of_the_pass_on_tensors(one_by_one):
+def test_a_recorded_loop_of_any_batch_is_propagated_with_cells_of_any():
+    references, cells = (line(0.1), line(-0.2)), partition(START, [2, 1, 1, 1])
+    tube = Affine().propagate(unicycle_loop(*references), cells, DISTURBANCE)
+    assert tube.lower.shape[:2] == (2, 2)
+    alone = Affine().propagate(unicycle_loop(references[1]), cells, DISTURBANCE)
+    torch.testing.assert_close(tube.lower[1], alone.lower, rtol=1e-9, atol=1e-11)
+
+
+def test_what_is_recorded_is_what_was_done_and_controls_are_bounded():
     loop, start, disturbance = LOOPS["unicycle"]
     cells = partition(start, [2, 1, 1, 2])
     found = Affine().reach(loop, cells, disturbance, watch=True)
-    one_by_one()
-    expected = Affine().reach(loop, cells, disturbance, watch=True)
-    record, other = found.recording, expected.recording
-    for side in ("control_lower", "control_upper"):
-        mine, theirs = getattr(found, side), getattr(expected, side)
-        torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-8)
-    assert (record.operations, record.widths) == (other.operations, other.widths)
-    assert record.slope.shape == other.slope.shape and record.kept.shape[:2] == (4, loop.horizon)
-    torch.testing.assert_close(record.radius, other.radius, rtol=1e-6, atol=1e-9)
+    lower, upper, record = found.control_lower, found.control_upper, found.recording
+    assert record.operations == ("leaky_relu", "leaky_relu", "cos", "sin", "product") and record.widths == (
+        6,
+        6,
+        1,
+        1,
+        2,
+    )
+    assert record.slope.shape == (4, loop.horizon, 16) and record.kept.shape[:2] == (4, loop.horizon)
+    assert bool((record.radius >= 0).all())
+    for c in range(4):
+        states = rollouts(loop, Box(cells.lower[c], cells.upper[c]), disturbance)
+        for k in range(loop.horizon):
+            u = loop.control(k, states[:, k])
+            assert bool(((lower[c, k] <= u) & (u <= upper[c, k])).all())
 
 
 @pytest.mark.parametrize(
     ("name", "shrunk"),
-    [(name, "rows") for name in ("unicycle", "quotients", "numbers")]
+    [(name, "affine_map") for name in ("unicycle", "quotients", "numbers")]
     + [(name, "radius") for name in ("unicycle", "quotients")],
 )
 def test_a_smaller_radius_than_a_relaxation_has_is_found_out(name, shrunk, monkeypatch):
@@ -140,16 +113,15 @@ def test_a_smaller_radius_than_a_relaxation_has_is_found_out(name, shrunk, monke
         return bool(((states < tube.lower - 1e-12) | (states > tube.upper + 1e-12)).any())
 
     assert not escapes()
-    honest = getattr(planned_operations.States, shrunk)
-    monkeypatch.setattr(planned_operations.States, shrunk, lambda *a, **options: 0.3 * honest(*a, **options))
+    owner = {"affine_map": Zonotope, "radius": Frame}[shrunk]
+    honest = getattr(owner, shrunk)
+
+    def smaller(*args, **options):
+        found = honest(*args, **options)
+        return dataclasses.replace(found, generators=0.3 * found.generators) if owner is Zonotope else 0.3 * found
+
+    monkeypatch.setattr(owner, shrunk, smaller)
     assert escapes()
-
-
-def test_what_cannot_be_folded_is_propagated_operation_by_operation():
-    loop, start, disturbance = Given(FromTheFront()), *LOOPS["angles"][1:]
-    tube = Affine().propagate(loop, start, disturbance)
-    states = rollouts(loop, start, disturbance)
-    assert bool(((tube.lower <= states) & (states <= tube.upper)).all())
 
 
 def test_where_a_gradient_is_wanted_the_pass_is_on_tensors():

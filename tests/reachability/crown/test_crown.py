@@ -20,6 +20,7 @@ from sagemp_cli.reachability.crown.steps import Steps
 from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.reachability.lirpa import adapter as lirpa_adapter
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
+from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import parallel
 from sagemp_cli.sets import Box
 
@@ -27,9 +28,9 @@ from ..propagator_cases import DISTURBANCE, START, AffineLoop, EveryOperation, l
 
 
 def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monkeypatch):
-    def edges(group, shape):
-        parts = zip(*(parallel(r.band) for r in group), strict=True)
-        return (torch.stack(part).reshape(shape) for part in parts)
+    def edges(group):
+        parts = zip(*(parallel(Band(*map(torch.from_numpy, r.band))) for r in group), strict=True)
+        return iter(map(torch.stack, parts))
 
     monkeypatch.setattr(backward_steps, "_lines", edges)
     for loop, start, w in (
@@ -118,8 +119,8 @@ def test_a_mistake_in_the_backward_pass_is_caught_by_an_attack(kind, monkeypatch
         return attack_tube(loop, start, w, tube, count=1500, generator=torch.Generator().manual_seed(4)).escapes
 
     assert attack() == 0
-    right = steps_module.compiled
-    monkeypatch.setattr(steps_module, "compiled", lambda steps: [broken(s, kind) for s in right(steps)])
+    right = steps_module.ready
+    monkeypatch.setattr(steps_module, "ready", lambda steps: [broken(s, kind) for s in right(steps)])
     assert attack() > 0
 
 

@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
-from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.interval.interval import Interval
+from sagemp_cli.reachability.program.loops import record
+from sagemp_cli.reachability.program.program import Instruction
 from sagemp_cli.sets import Box
 
 from ..propagator_cases import DISTURBANCE, START, line, unicycle_loop
@@ -44,25 +46,38 @@ def test_an_operation_encloses_all_values_and_grows_with_the_set(name):
     t[:100] = torch.sign(t[:100])
     points = center + t * radius
     values = f(points[:, 0], points[:, 1])
-    a, b = (IntervalForm(c - r - 1e-15, c + r + 1e-15) for c, r in zip(center, radius, strict=True))
-    lower, upper = f(a, b).bounds()
+    program = record(lambda x, w: f(x[0], x[1]).reshape(1) + 0 * x, torch.zeros(2).double(), torch.zeros(1).double())
+
+    def bounded(more):
+        x = IntervalForm((center - radius - more).T, (center + radius + more).T)
+        zero = torch.zeros(1, dtype=torch.float64)
+        found = program.run(x, IntervalForm(zero, zero), evaluate=evaluate).next
+        return found.lower[:, 0], found.upper[:, 0]
+
+    lower, upper = bounded(1e-15)
     assert bool((lower <= values).all()) and bool((values <= upper).all())
-    wider = f(*(IntervalForm(v.lower - 0.1, v.upper + 0.1) for v in (a, b)))
-    assert bool((wider.lower <= lower).all()) and bool((wider.upper >= upper).all())
+    wider = bounded(0.1)
+    assert bool((wider[0] <= lower).all()) and bool((wider[1] >= upper).all())
+
+
+def of(kind, *operands: IntervalForm) -> IntervalForm:
+    """What an instruction makes of intervals."""
+    return evaluate(Instruction(kind, max(len(o.lower) for o in operands), tuple(range(len(operands)))), operands)
 
 
 def test_a_quotient_by_a_set_with_zero_is_unbounded_and_nothing_is_ever_nan():
-    quotient = interval([1.0, 1.0], [2.0, 2.0]) / interval([-1.0, 1.0], [1.0, 2.0])
+    quotient = of("div", interval([1.0, 1.0], [2.0, 2.0]), interval([-1.0, 1.0], [1.0, 2.0]))
     assert quotient.lower.tolist()[0] == -math.inf and quotient.upper.tolist()[0] == math.inf
     assert math.isfinite(quotient.lower.tolist()[1])
-    unknown = interval([-math.inf], [math.inf])
-    for value in (unknown - unknown, 0.0 * unknown, unknown / unknown, torch.exp(unknown), torch.sin(unknown)):
+    unknown, zero = interval([-math.inf], [math.inf]), interval([0.0], [0.0])
+    found = [of("sub", unknown, unknown), of("mul", zero, unknown), of("div", unknown, interval([-9e99], [math.inf]))]
+    for value in (*found, of("exp", unknown), of("sin", unknown)):
         assert not bool(torch.isnan(value.lower).any() | torch.isnan(value.upper).any())
-    assert torch.sin(unknown).bounds() == (-1, 1)
+    assert of("sin", unknown).bounds == (-1, 1)
 
 
 def test_ends_are_rounded_outwards():
-    total = interval([0.1], [0.1]) + 0.2
+    total = of("add", interval([0.1], [0.1]), interval([0.2], [0.2]))
     assert float(total.lower) < float(total.upper)
     assert 0.1 + 0.2 in (math.nextafter(float(total.lower), 1), math.nextafter(float(total.upper), 0))
 

@@ -2,17 +2,17 @@
 
 import pytest
 import torch
-from random_programs import OperationByOperation, escaped, random_problem, worst_rollouts
+from random_programs import escaped, random_problem, worst_rollouts
 
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.affine.form import StepFrame
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.interval.form import IntervalForm
 from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.reachability.interval.operands import operands, sharper
+from sagemp_cli.reachability.program.loops import recorded
 from sagemp_cli.sets import Box
 
-from ..affine.test_compiled_run import Given
 from ..propagator_cases import rollouts
 
 NOTHING = Box.around([0.0, 0.0], [0.0, 0.0])
@@ -53,19 +53,17 @@ class Step:
 def test_what_has_bounds_is_bounded(name, propagator):
     function, center, radius = NEEDLESS[name]
     start = Box.around(center, radius)
-    for loop in (Step(function), Given(Step(function))):
-        tube = propagator.propagate(loop, start, NOTHING)
-        states = rollouts(loop, start, NOTHING)
-        assert bool(torch.isfinite(tube.width).all())
-        assert bool(((tube.lower <= states) & (states <= tube.upper)).all())
+    loop = Step(function)
+    tube, states = propagator.propagate(loop, start, NOTHING), rollouts(loop, start, NOTHING)
+    assert bool(torch.isfinite(tube.width).all())
+    assert bool(((tube.lower <= states) & (states <= tube.upper)).all())
 
 
 @pytest.mark.parametrize("function", [torch.sqrt, torch.reciprocal, torch.log, lambda x: x**-2], ids=str)
 def test_beyond_a_pole_and_the_end_of_a_domain_stays_infinite(function):
     loop = Step(lambda x, w: function(x) + w)
-    for one in (loop, Given(loop)):
-        tube = Affine().propagate(one, Box.around([0.0, 1.0], [1.0, 0.5]), NOTHING)
-        assert bool(torch.isinf(tube.width[1]).all())
+    tube = Affine().propagate(loop, Box.around([0.0, 1.0], [1.0, 0.5]), NOTHING)
+    assert bool(torch.isinf(tube.width[1]).all())
 
 
 def test_cells_that_need_no_help_are_not_disturbed():
@@ -80,15 +78,11 @@ def test_cells_that_need_no_help_are_not_disturbed():
 @pytest.mark.parametrize("seed", range(40))
 def test_operands_come_in_the_order_of_the_forms_and_hold(seed):
     loop, start, disturbance = random_problem(seed)
-    found = operands(
-        lambda x, w: loop.step(0, x, w), (start.lower, start.upper), (disturbance.lower, disturbance.upper)
-    )
-    frame = StepFrame(torch.diag_embed(start.radius), start.radius, disturbance.radius)
-    loop.step(0, frame.state(start.center), frame.disturbance(disturbance.center))
-    assert [(h.name, h.size) for h in found] == [(r.name, frame.entries(r.center.shape)) for r in frame.relaxations]
-    for one in (loop, OperationByOperation(loop)):
-        with torch.no_grad():
-            box, everywhere = (start.lower, start.upper), torch.tensor(True)
-            known = sharper(lambda x, w: loop.step(0, x, w), box, disturbance, None, where=everywhere)
-            tube = Affine().run(one, start, disturbance, horizon=1, hints=[known]).tube
-        assert escaped(tube, worst_rollouts(loop, start, disturbance, count=200, rounds=3)[:, :2]) == 0
+    program = recorded(loop, start, disturbance).programs[0]
+    x, w = (IntervalForm(box.lower, box.upper) for box in (Box(start.lower[None], start.upper[None]), disturbance))
+    found = operands(program, x, w, IntervalForm(torch.zeros(0), torch.zeros(0)))
+    step = Affine().run(loop, start, disturbance, horizon=1, keep_steps=True).steps[0]
+    assert [(h.name, h.size) for h in found] == [(r.name, r.radius.shape[-1]) for r in step.relaxed]
+    known = sharper(found, None, where=torch.tensor([True]))
+    tube = Affine().run(loop, start, disturbance, horizon=1, hints=[known]).tube
+    assert escaped(tube, worst_rollouts(loop, start, disturbance, count=200, rounds=3)[:, :2]) == 0

@@ -140,5 +140,5 @@ def test_wrong_options_and_boxes_are_refused_in_one_line():
         AutoLirpa(method="alpha")
     with pytest.raises(ConfigError, match="steps must be a positive integer, found 0"):
         AutoLirpa(steps=0)
-    with pytest.raises(UsageError, match=r"start must have shape \(\.\.\., 2\)"):
+    with pytest.raises(UsageError, match="the start box has 4 dimensions, the loop's state has 2"):
         AutoLirpa().propagate(Affine(), START, DISTURBANCE)

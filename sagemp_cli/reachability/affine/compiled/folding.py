@@ -1,363 +1,222 @@
-"""A step of a loop as a short list of nonlinear operations, with all that is linear between them folded into matrices.
+"""A step program as a short list of nonlinear operations, with all that is linear between them folded into matrices.
 
-Most operations of a step are linear: errors of a lookahead, layers, scales, ``x + dt (...)``. Evaluated on a set, each
-costs several tensor operations on a few numbers. So a loop whose steps differ in given numbers only
-(:class:`~sagemp_cli.reachability.affine.compiled.foldable_loop.FoldableLoop`)
-is evaluated once on :class:`FoldedForm`, values that are known as fixed combinations of the
-step's *basic* values: 1, the given numbers, the states, the disturbances, and the results of the nonlinear operations
-before. What comes out, the :class:`Plan`, says which nonlinear operations there are and which combinations go into
-them; :mod:`sagemp_cli.reachability.affine.compiled.run` evaluates them.
+Most instructions of a step are linear: errors of a lookahead, layers, scales, ``x + dt (...)``. Evaluated on a set,
+each costs several operations on a few numbers. So every slot is written as a fixed combination of the step's *basic*
+values: 1, the numbers of the step, the states, the disturbances, and the results of the nonlinear operations before.
+What comes out, the :class:`Compiled`, says which nonlinear operations there are and which combinations go into them;
+:mod:`sagemp_cli.reachability.affine.compiled.run` evaluates them, one after the other in the order of the program.
 
 Rounding. A coefficient as computed differs from the exact one by at most ``error`` times its entry in ``sizes``, which
-obeys the same recurrences with absolute values: as for :mod:`~sagemp_cli.reachability.affine.form`, entry by entry.
+obeys the same recurrences with absolute values (:mod:`sagemp_cli.sets.rounding`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from sagemp_cli.errors import UnsupportedOperationError
-from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable
-from sagemp_cli.reachability.form import ANGLE, Form, Operation, registers
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.reachability.program.kinds import INPUTS
+from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
+from sagemp_cli.reachability.relaxations.registry import Relaxation, relaxation
+from sagemp_cli.sets.rounding import TINY, dot, gamma
 
-Kind = Literal["scalar", "product", "quotient", "angle"]
+Rule = Literal["function", "product", "quotient", "angle"]
 
 
 class Combination(NamedTuple):
     """Vectors ``(rows,)`` of values as combinations of the basic ones.
 
     Attributes:
-        matrix, sizes: ``(rows, columns)``; columns are 1, given numbers, states, disturbances, results.
+        matrix, sizes: ``(rows, columns)``; columns are 1, numbers, states, disturbances, results; those to come are 0.
         error: of an entry of the matrix, relative to that of ``sizes``.
     """
 
     matrix: Tensor
     sizes: Tensor
-    error: float
+    error: float = 0.0
+
+    @staticmethod
+    def constant(value: Tensor) -> Combination:
+        """Fixed numbers."""
+        return Combination(value[:, None], value[:, None].abs())
+
+    def moved(self, map_: Callable[[Tensor], Tensor]) -> Combination:
+        """What a map that only moves rows makes of it (exact)."""
+        return Combination(map_(self.matrix), map_(self.sizes), self.error)
+
+    def padded(self, columns: int) -> Combination:
+        """With as many columns."""
+        missing = columns - self.matrix.shape[-1]
+        return self.moved(lambda t: pad(t, (0, missing))) if missing else self
 
 
 class Node(NamedTuple):
     """A nonlinear operation.
 
     Attributes:
-        kind: "scalar", a function of one variable; "product"; "quotient", whose third operand is the reciprocal of
-            the second; or "angle", whose operands are y and x.
+        rule: "function", of one variable; "product"; "quotient", whose third operand is the reciprocal of the second;
+            or "angle", whose operands are y and x.
         operands: its operands, one after the other.
         size: entries of its result.
-        name, operation, parameters: of a function of one variable.
+        relaxation: of a function or an angle.
     """
 
-    kind: Kind
+    rule: Rule
     operands: Combination
     size: int
-    name: str = ""
-    operation: Operation | None = None
-    parameters: tuple[Any, ...] = ()
+    relaxation: Relaxation | None = None
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, eq=False)
+class Compiled:
     """A step.
 
     Attributes:
         numbers, states, disturbances: how many there are.
         nodes: in the order of evaluation.
-        state: the next state.
-        control: the control, if the loop says what it is.
+        outputs: combinations.
     """
 
     numbers: int
     states: int
     disturbances: int
     nodes: tuple[Node, ...]
-    state: Combination
-    control: Combination | None
+    outputs: Outputs
+
+    @property
+    def watched(self) -> Combination | None:
+        """Control and deviation, one after the other, as far as the program says them."""
+        parts = [part for part in (self.outputs.control, self.outputs.deviation) if part is not None]
+        return _joined(parts) if parts else None
 
     def split(self, matrix: Tensor) -> tuple[Tensor, ...]:
-        """A combination's columns: of 1, given numbers, states, disturbances, and each result that it may read."""
+        """A combination's columns: of 1, numbers, states, disturbances, and each result that it may read."""
         sizes = [1, self.numbers, self.states, self.disturbances]
         for node in self.nodes:
             if sum(sizes) < matrix.shape[-1]:
                 sizes.append(node.size)
-        return matrix.split(sizes, dim=-1)
+        return pad(matrix, (0, max(sum(sizes[:4]) - matrix.shape[-1], 0))).split(sizes, dim=-1)
 
 
-def plan_of(loop: FoldableLoop, given: torch.Size, states: int, disturbances: int) -> Plan:
-    """The plan of a loop's steps.
-
-    Args:
-        loop: the loop.
-        given: shape of a step's numbers, without batch.
-        states, disturbances: how many.
-
-    Raises:
-        NotFoldable: there is none.
-    """
-    numbers = math.prod(given)
-    width = 1 + numbers + states + disturbances
-    noted = _Noted([], width)
-    unit = torch.eye(width, dtype=torch.float64)[1:]
-
-    def basic(first: int, *shape: int) -> FoldedForm:
-        rows = unit[first : first + math.prod(shape)].reshape(1, *shape, width)  # a batch of one stands for any batch
-        return FoldedForm(noted, rows, rows, 0.0)
-
-    after, control = loop.step_given(basic(0, *given), basic(numbers, states), basic(numbers + states, disturbances))
-    if not isinstance(after, FoldedForm) or after.shape != (1, states):
-        raise NotFoldable
-    return Plan(
-        numbers,
-        states,
-        disturbances,
-        tuple(noted.nodes),
-        after.combination(),
-        None if control is None else control.combination(),
-    )
+def compiled(program: Program) -> Compiled:
+    """The program, folded."""
+    return _Folding(program).result()
 
 
-@dataclass
-class _Noted:
+class _Folding:
     """The operations so far, and how many basic values there are."""
 
-    nodes: list[Node]
-    columns: int
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._nodes: list[Node] = []
+        self._columns = 1
+        self._inputs = {}
+        for kind, size in zip(
+            ("numbers", "state", "disturbance"), (program.numbers, program.states, program.disturbances), strict=True
+        ):
+            self._inputs[kind] = self._basic(size)
 
-    def result(self, node: Node, shape: torch.Size) -> FoldedForm:
-        """Note an operation; its result is basic from here on."""
-        self.nodes.append(node)
-        self.columns += node.size
-        rows = torch.eye(self.columns, dtype=torch.float64)[-node.size :].reshape(*shape, -1)
-        return FoldedForm(self, rows, rows, 0.0)
+    def result(self) -> Compiled:
+        """What the program is."""
+        p = self._program
+        outputs = p.run(*(self._inputs[kind] for kind in INPUTS), evaluate=self._evaluated)
+        return Compiled(p.numbers, p.states, p.disturbances, tuple(self._nodes), outputs)
+
+    def _basic(self, size: int) -> Combination:
+        first, self._columns = self._columns, self._columns + size
+        rows = torch.eye(self._columns, dtype=torch.float64)[first:]
+        return Combination(rows, rows)
+
+    def _node(self, rule: Rule, size: int, operands: Combination, how: Relaxation | None = None) -> Combination:
+        self._nodes.append(Node(rule, operands, size, how))
+        return self._basic(size)
+
+    def _evaluated(self, i: Instruction, operands: Sequence[Combination]) -> Combination:
+        if i.kind in ("constant", "pick", "join", "linear"):
+            return self._linear(i, operands)
+        if i.kind == "neg":
+            return Combination(-operands[0].matrix, operands[0].sizes, operands[0].error)
+        if len(operands) == 1:
+            return self._node("function", i.size, operands[0], relaxation(i.kind, i.constants))
+        a, b = (o if len(o.matrix) == i.size else o.moved(lambda t: t.expand(i.size, -1)) for o in operands)
+        constant = [_is_constant(o) for o in (a, b)]
+        if i.kind in ("add", "sub"):
+            return _sum(a, b, 1.0 if i.kind == "add" else -1.0)
+        if i.kind == "mul":
+            if any(constant):
+                return _scaled(a, b) if constant[1] else _scaled(b, a)
+            return self._node("product", i.size, _joined([a, b]))
+        if i.kind == "div":
+            return self._quotient(i, a, b, constant)
+        if i.kind == "atan2":
+            return self._node("angle", i.size, _joined([a, b]), relaxation(i.kind))
+        return self._extreme(i, a, b, constant)
+
+    def _linear(self, i: Instruction, operands: Sequence[Combination]) -> Combination:
+        if i.kind == "constant":
+            return Combination.constant(i.constants[0])
+        if i.kind == "pick":
+            entries = torch.tensor(i.entries)
+            return operands[0].moved(lambda t: t[entries])
+        if i.kind == "join":
+            return _joined(operands)
+        weight, bias = i.constants
+        (x,) = operands
+        sizes = weight.abs() @ x.sizes
+        y = Combination(weight @ x.matrix, sizes + _tiny(sizes), x.error + dot(weight.shape[-1]))
+        return _sum(y, Combination.constant(bias)) if bool(bias.any()) or bias.requires_grad else y
+
+    def _quotient(self, i: Instruction, a: Combination, b: Combination, constant: Sequence[bool]) -> Combination:
+        if constant[1]:
+            value = b.matrix[:, :1]
+            return Combination(a.matrix / value, a.sizes / value.abs() + _tiny(a.sizes), a.error + gamma(1))
+        reciprocal = self._node("function", i.size, b, relaxation("reciprocal"))
+        if constant[0]:
+            return _scaled(reciprocal, a)
+        return self._node("quotient", i.size, _joined([a, b, reciprocal]))
+
+    def _extreme(self, i: Instruction, a: Combination, b: Combination, constant: Sequence[bool]) -> Combination:
+        """``maximum`` is ``b + relu(a - b)`` and ``minimum`` is ``a - relu(a - b)``: what both share cancels."""
+        largest = i.kind == "maximum"
+        if any(constant):
+            value, limit = (a, b) if constant[1] else (b, a)
+            limit = limit.matrix[:, 0]
+            none = torch.full_like(limit, -torch.inf if largest else torch.inf)
+            limits = (limit, -none) if largest else (-none, limit)
+            return self._node("function", i.size, value, relaxation("clamp", limits))
+        relu = self._node("function", i.size, _sum(a, b, -1.0), relaxation("relu"))
+        return _sum(b, relu) if largest else _sum(a, relu, -1.0)
 
 
-class FoldedForm(Form):
-    """An array of fixed combinations of a step's basic values, a batch of one in front.
-
-    Attributes:
-        noted: the operations so far.
-        rows, sizes, error: as for :class:`Combination`, ``(*shape, columns)``; columns to come are 0.
-    """
-
-    __slots__ = ("error", "noted", "rows", "sizes")
-
-    def __init__(self, noted: _Noted, rows: Tensor, sizes: Tensor, error: float) -> None:
-        self.noted, self.rows, self.sizes, self.error = noted, rows, sizes, error
-
-    @property
-    def shape(self) -> torch.Size:
-        """Shape, the batch of one first."""
-        return self.rows.shape[:-1]
-
-    def dim(self) -> int:
-        """Number of dimensions."""
-        return self.rows.dim() - 1
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Always float64."""
-        return self.rows.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the tensors."""
-        return self.rows.device
-
-    def combination(self) -> Combination:
-        """All entries as one vector."""
-        if self.shape[:1] != (1,):
-            raise NotFoldable
-        return Combination(self.rows.flatten(0, -2), self.sizes.flatten(0, -2), self.error)
-
-    def moved_by(self, map_: Callable[[Tensor], Tensor]) -> FoldedForm:
-        """What a map of tensors that have the columns as one more dimension does to the entries (exact)."""
-        return FoldedForm(self.noted, map_(self.rows), map_(self.sizes), self.error)
-
-    def relaxed(self, name: str, operation: Operation, *parameters: Any) -> FoldedForm:
-        """The function's result."""
-        flat = tuple(p.expand(self.shape).flatten() if isinstance(p, Tensor) else p for p in parameters)
-        node = Node("scalar", self.combination(), math.prod(self.shape), name, operation, flat)
-        return self.noted.result(node, self.shape)
-
-    def angle(self, x: FoldedForm) -> FoldedForm:
-        """The angle of a point."""
-        return _of_several("angle", self, x, name="atan2", operation=ANGLE)
-
-    def __getitem__(self, index: Any) -> FoldedForm:
-        index = index if isinstance(index, tuple) else (index,)
-        if index[:1] != (Ellipsis,) or sum(i is not None for i in index[1:]) >= self.dim():
-            raise NotFoldable  # the batch in front is any batch, not this one
-        return self.moved_by(lambda t: t[(*index, slice(None))])
+def _is_constant(a: Combination) -> bool:
+    return a.matrix.shape[-1] == 1
 
 
-FoldedForm.handlers = {}
-handles = registers(FoldedForm.handlers)
+def _joined(parts: Sequence[Combination]) -> Combination:
+    """One after the other."""
+    columns = max(part.matrix.shape[-1] for part in parts)
+    rows = [part.padded(columns) for part in parts]
+    return Combination(*(torch.cat([r[j] for r in rows]) for j in range(2)), max(r.error for r in rows))
 
 
-def _same(*values: Any) -> list[FoldedForm]:
-    """Forms and constants as forms with as many columns."""
-    noted = next(v.noted for v in values if isinstance(v, FoldedForm))
-    width = max(v.rows.shape[-1] for v in values if isinstance(v, FoldedForm))
-    forms = []
-    for v in values:
-        if isinstance(v, FoldedForm):
-            forms.append(v.moved_by(lambda t: torch.nn.functional.pad(t, (0, width - t.shape[-1]))))
-        else:
-            value = torch.as_tensor(v, dtype=torch.float64)[..., None]
-            rows = torch.nn.functional.pad(value, (0, width - 1))
-            forms.append(FoldedForm(noted, rows, rows.abs(), 0.0))
-    return forms
+def _sum(a: Combination, b: Combination, sign: float = 1.0) -> Combination:
+    """``a + sign b``."""
+    columns = max(a.matrix.shape[-1], b.matrix.shape[-1])
+    a, b = a.padded(columns), b.padded(columns)
+    return Combination(torch.add(a.matrix, b.matrix, alpha=sign), a.sizes + b.sizes, max(a.error, b.error) + gamma(1))
+
+
+def _scaled(a: Combination, constant: Combination) -> Combination:
+    """A multiple of each row."""
+    value = constant.matrix
+    return Combination(a.matrix * value, a.sizes * value.abs() + _tiny(a.sizes), a.error + gamma(1))
 
 
 def _tiny(sizes: Tensor) -> Tensor:
     """What absorbs underflow, where there is an entry at all."""
     return TINY * (sizes > 0)
-
-
-@handles(torch.add, torch.Tensor.add, torch.Tensor.__add__, torch.Tensor.__radd__)
-def add(a: Any, b: Any, *, alpha: float = 1) -> FoldedForm:
-    """Sum of forms and constants."""
-    if alpha != 1:
-        b = multiply(b, alpha) if isinstance(b, FoldedForm) else torch.as_tensor(b, dtype=torch.float64) * alpha
-    x, y = _same(a, b)
-    # Two units: the second is for the rounding of alpha times a constant.
-    return FoldedForm(x.noted, x.rows + y.rows, x.sizes + y.sizes, max(x.error, y.error) + 2 * UNIT)
-
-
-@handles(torch.sub, torch.Tensor.sub, torch.Tensor.__sub__)
-def subtract(a: Any, b: Any, *, alpha: float = 1) -> FoldedForm:
-    """Difference."""
-    return add(a, b, alpha=-alpha)
-
-
-@handles(torch.rsub, torch.Tensor.__rsub__)
-def reverse_subtract(a: Any, b: Any) -> FoldedForm:
-    """``b - a``."""
-    return add(b, a, alpha=-1)
-
-
-@handles(torch.neg, torch.Tensor.neg, torch.Tensor.__neg__)
-def negate(a: FoldedForm) -> FoldedForm:
-    """Negation (exact)."""
-    return FoldedForm(a.noted, -a.rows, a.sizes, a.error)
-
-
-@handles(torch.mul, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
-def multiply(a: Any, b: Any) -> FoldedForm:
-    """Product with a constant, or of two forms."""
-    if isinstance(a, FoldedForm) and isinstance(b, FoldedForm):
-        return _of_several("product", a, b)
-    a, b = (a, b) if isinstance(a, FoldedForm) else (b, a)
-    value = torch.as_tensor(b, dtype=torch.float64)[..., None]
-    return FoldedForm(a.noted, a.rows * value, a.sizes * value.abs() + _tiny(a.sizes), a.error + UNIT)
-
-
-@handles(torch.div, torch.Tensor.div, torch.true_divide, torch.Tensor.__truediv__)
-def divide(a: Any, b: Any) -> FoldedForm:
-    """Quotient with a constant denominator, or of two forms."""
-    if isinstance(b, FoldedForm):
-        reciprocal = torch.reciprocal(b)
-        return _of_several("quotient", a, b, reciprocal) if isinstance(a, FoldedForm) else multiply(reciprocal, a)
-    value = torch.as_tensor(b, dtype=torch.float64)[..., None]
-    return FoldedForm(a.noted, a.rows / value, a.sizes / value.abs() + _tiny(a.sizes), a.error + 2 * UNIT)
-
-
-def _of_several(kind: Kind, *operands: FoldedForm, **made_of: Any) -> FoldedForm:
-    """The result of an operation whose operands are broadcast to one shape."""
-    forms = _same(*operands)
-    shape = np.broadcast_shapes(*(f.shape for f in forms))
-    parts = [f.moved_by(lambda t: t.expand(*shape, -1)).combination() for f in forms]
-    matrix, sizes = (torch.cat([part[i] for part in parts]) for i in range(2))
-    node = Node(kind, Combination(matrix, sizes, max(f.error for f in forms)), math.prod(shape), **made_of)
-    return forms[0].noted.result(node, shape)
-
-
-@handles(torch.nn.functional.linear)
-def linear(x: FoldedForm, weight: Tensor, bias: Tensor | None = None) -> FoldedForm:
-    """``x W^T + b``."""
-    if x.dim() == 1:
-        raise NotFoldable
-    sizes = weight.abs() @ x.sizes
-    y = FoldedForm(x.noted, weight @ x.rows, sizes + _tiny(sizes), x.error + (weight.shape[-1] + 2) * UNIT)
-    return y if bias is None else add(y, bias)
-
-
-@handles(torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__)
-def matrix_product(x: Any, y: Any) -> FoldedForm:
-    """``x @ W`` for a constant matrix."""
-    if isinstance(y, FoldedForm) or y.dim() != 2:
-        raise UnsupportedOperationError("torch.matmul is supported as x @ W with a constant two-dimensional W")
-    return linear(x, y.transpose(0, 1))
-
-
-@handles(torch.sum, torch.Tensor.sum)
-def total(x: FoldedForm, dim: Any = None, keepdim: bool = False) -> FoldedForm:
-    """Sum over one event dimension."""
-    if not isinstance(dim, int):
-        raise UnsupportedOperationError(f"torch operation 'sum' is supported over one dimension, found dim={dim}")
-    summed = x.moved_by(lambda t: t.sum(_of_columns(dim, x.dim()), keepdim))
-    return FoldedForm(x.noted, summed.rows, summed.sizes, x.error + x.shape[dim] * UNIT)
-
-
-def _of_columns(dim: int, dims: int) -> int:
-    """A dimension, counted from the end and behind the batch, where there is one more, the columns.
-
-    Raises:
-        NotFoldable: it is counted from the front, or is the batch.
-    """
-    if not -dims < dim < 0:
-        raise NotFoldable
-    return dim - 1
-
-
-@handles(torch.stack)
-def stack(values: Sequence[Any], dim: int = 0) -> FoldedForm:
-    """Stack forms and constants."""
-    return _joined(torch.stack, values, dim)
-
-
-@handles(torch.cat, torch.concat, torch.concatenate)
-def cat(values: Sequence[Any], dim: int = 0) -> FoldedForm:
-    """Concatenate forms and constants."""
-    return _joined(torch.cat, values, dim)
-
-
-def _joined(join: Callable[..., Tensor], values: Sequence[Any], dim: int) -> FoldedForm:
-    most = max(len(v.shape) for v in values if isinstance(v, FoldedForm))
-    forms = [f if f.dim() == most else f.moved_by(lambda t: t[None]) for f in _same(*values)]  # constants lack a batch
-    at = _of_columns(dim, most + (join is torch.stack))
-    rows, sizes = (join([getattr(f, part) for f in forms], at) for part in ("rows", "sizes"))
-    return FoldedForm(forms[0].noted, rows, sizes, max(f.error for f in forms))
-
-
-@handles(torch.unbind, torch.Tensor.unbind)
-def unbind(x: FoldedForm, dim: int = 0) -> tuple[FoldedForm, ...]:
-    """Slices along one dimension."""
-    at = _of_columns(dim, x.dim())
-    return tuple(x.moved_by(lambda t, i=i: t.select(at, i)) for i in range(x.shape[dim]))
-
-
-@handles(torch.flatten, torch.Tensor.flatten)
-def flatten(x: FoldedForm, start_dim: int = 0, end_dim: int = -1) -> FoldedForm:
-    """Merge event dimensions."""
-    first, last = (_of_columns(dim, x.dim()) for dim in (start_dim, end_dim))
-    return x.moved_by(lambda t: t.flatten(first, last))
-
-
-@handles(torch.unsqueeze, torch.Tensor.unsqueeze)
-def unsqueeze(x: FoldedForm, dim: int) -> FoldedForm:
-    """Insert a dimension."""
-    return x.moved_by(lambda t: t.unsqueeze(_of_columns(dim, x.dim() + 1)))
-
-
-@handles(torch.squeeze, torch.Tensor.squeeze)
-def squeeze(x: FoldedForm, dim: int) -> FoldedForm:
-    """Remove a dimension of size one."""
-    return x.moved_by(lambda t: t.squeeze(_of_columns(dim, x.dim())))

@@ -1,7 +1,17 @@
-"""The values and the nonlinear operations of a step on arrays.
+"""The affine rules: values of a step as forms of what they depend on, and what a nonlinear operation makes of them.
 
-The counterpart, cells first, of :class:`~sagemp_cli.reachability.affine.form.StepFrame` and of the operations of
-:mod:`~.affine.operations`; :mod:`~sagemp_cli.reachability.affine.compiled.run` puts them together.
+Within one step a value is enclosed as ::
+
+    y in c + sum_i coefficient_i z_i + [-e, e],        e = error * magnitude
+
+where the variables ``z`` are, in this order, the deviations of the state from the centre of the current set (a zonotope
+``z_x = G eps``), the deviations of the disturbance (a box), and the relaxation errors of this step, one per entry of
+each nonlinear operation. ``magnitude`` obeys the same recurrences as the value with absolute values, so that rounding
+is at most ``error`` times it (:mod:`sagemp_cli.sets.rounding`). A nonlinear operation is replaced by a band; it takes
+the rounding of its input into its own radius and starts again.
+
+Everything is written once, for numpy's arrays, whose operations on a few numbers cost a fifth of torch's, and for
+tensors, through which a tube is differentiated.
 """
 
 from __future__ import annotations
@@ -10,21 +20,24 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
+from sagemp_cli.reachability.affine.compiled.arrays import contiguous, like, with_fresh
 from sagemp_cli.reachability.affine.compiled.folding import Node
-from sagemp_cli.reachability.affine.form import SAFETY, Hint, Hints, hint_of
+from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints, hint_of
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
-from sagemp_cli.reachability.relaxations.functions import on_tensors
+from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.sets.rounding import BAND, SAFETY, SHIFT, TINY, of_generators, of_product, over_symbols
+from sagemp_cli.sets.zonotope import Zonotope
 
-Array = np.ndarray
+Array = np.ndarray | Tensor
 
 
 class Value(NamedTuple):
-    """A vector in the form of :mod:`~sagemp_cli.reachability.affine.form`, cells first.
+    """A vector as forms, cells first.
 
     Attributes:
         both: centre and magnitude, ``(2, B, e)``.
@@ -37,8 +50,66 @@ class Value(NamedTuple):
     error: float
 
 
-class Record(NamedTuple):
-    """A nonlinear operation as :class:`~sagemp_cli.reachability.affine.form.Relaxed` describes it."""
+class Factors(NamedTuple):
+    """The deviations X and Y of a product's factors, as ``P = l X + Y / l`` and ``M = l X - Y / l``:
+    ``X Y = (P^2 - M^2) / 4``.
+
+    Attributes:
+        x, y: coefficients of X and Y, ``(B, e, variables)``.
+        scale: l.
+        plus, minus: bounds of ``|P|`` and ``|M|``, rounding included.
+        radius_x, radius_y: of ``|X|`` and ``|Y|``.
+        middle: what the product's form counts of ``X Y`` itself; the rest is its error.
+        magnitude_x, magnitude_y: of the factors.
+    """
+
+    x: Array
+    y: Array
+    scale: Array
+    plus: Array
+    minus: Array
+    radius_x: Array
+    radius_y: Array
+    middle: Array
+    magnitude_x: Array
+    magnitude_y: Array
+
+    @property
+    def sum(self) -> Array:
+        """Coefficients of P."""
+        return self.x * self.scale[..., None] + self.y / self.scale[..., None]
+
+    @property
+    def difference(self) -> Array:
+        """Coefficients of M."""
+        return self.x * self.scale[..., None] - self.y / self.scale[..., None]
+
+    @property
+    def size(self) -> Array:
+        """Bound of ``|l X|`` and ``|Y / l|``, rounding included."""
+        return np.maximum(self.radius_x * self.scale, self.radius_y / self.scale) * SAFETY
+
+    @property
+    def magnitude(self) -> Array:
+        """Of ``l X`` and ``Y / l`` together."""
+        return self.magnitude_x * self.scale + self.magnitude_y / self.scale
+
+
+class Relaxed(NamedTuple):
+    """One nonlinear operation of a step, as it was relaxed: all that a certificate or a backward pass needs of it.
+
+    Attributes:
+        name: of the operation.
+        band: the one used; of a product its scale, middle and radius.
+        radius: of the variables it added, rounding included: the band's error is ``radius * z``, ``(B, e)``.
+        first: index of the first of them.
+        form: the input's; of a product the product's own.
+        lower, upper: the input's bounds that the band was made for (None for a product).
+        node: what was evaluated.
+        factors: of a product.
+        given: what else the lines depend on, after the bounds, in the input's shape.
+        turn: of an angle, the direction across which its input is (:mod:`.relaxations.arctangent2`).
+    """
 
     name: str
     band: Band
@@ -48,96 +119,99 @@ class Record(NamedTuple):
     lower: Array | None = None
     upper: Array | None = None
     node: Node | None = None
-    factors: tuple[Array, ...] = ()
+    factors: Factors | None = None
     given: tuple[Array, ...] = ()
     turn: Turn | None = None
 
 
-class States:
-    """The state set before a step, and the variables of the step so far: the array's counterpart of
-    :class:`~sagemp_cli.reachability.affine.form.StepFrame`.
+class Frame:
+    """The state set before a step, and the variables of the step so far.
 
     Args:
-        center, reach: of the set, ``(B, n)``; reach is an upper bound of its radius.
-        generators: ``(B, n, M)``.
+        states: the set, one for each of B cells.
         inputs: how many states and disturbances there are.
         own_radius: radii of all variables that a step has but the states.
         hints: what is known of the operations.
+
+    Attributes:
+        both: centre and magnitude of the states, ``(2, B, n)``.
+        size: number of variables so far.
+        relaxed: the operations so far.
     """
 
-    def __init__(
-        self,
-        center: Array,
-        reach: Array,
-        generators: Array,
-        *,
-        inputs: int,
-        own_radius: Array,
-        hints: Hints | None = None,
-    ) -> None:
-        self.both = np.array([center, np.abs(center) + reach + TINY])
-        self.reach, self.generators, self.hints = reach, generators, hints
-        self.own_radius = own_radius
+    def __init__(self, states: Zonotope, *, inputs: int, own_radius: Array, hints: Hints | None = None) -> None:
+        self._m = functions_of(states.center)
+        self.both = self._m.stack([states.center, abs(states.center) + states.reach + TINY])
+        self.states, self.hints, self.own_radius = states, hints, own_radius
         self.size = inputs
-        self.records: list[Record] = []
+        self.relaxed: list[Relaxed] = []
 
     @property
     def sum_error(self) -> float:
         """Relative error of sums over all symbols and of the products with the generators."""
-        return 2 * (self.generators.shape[-1] + self.size + 64) * UNIT
+        return over_symbols(self.states.order, self.size)
 
-    def rows(self, coefficients: Array, extra: int = 0) -> Array:
-        """A vector in terms of all symbols, ``(B, e, symbols)``, with so many more columns of zeros."""
-        n, count = self.generators.shape[-2:]
-        own = coefficients.shape[-1] - n
-        rows = np.empty((len(self.generators), coefficients.shape[-2], count + own + extra))
-        np.matmul(coefficients[..., :n], self.generators, out=rows[..., :count])
-        if own:
-            np.multiply(coefficients[..., n:], self.own_radius[:own], out=rows[..., count : count + own])
-        if extra:
-            rows[..., count + own :] = 0.0
-        return rows
+    def rounding(self, after: Value) -> Array:
+        """What the next state is off by, that of its coefficients in terms of all symbols included."""
+        return after.both[1] * ((after.error + of_generators(self.both.shape[-1])) * SAFETY)
+
+    def advanced(self, after: Value) -> Zonotope:
+        """The set after the step whose next state that is."""
+        n = self.both.shape[-1]
+        own = after.coefficients[..., n:]
+        return self.states.affine_map(
+            after.coefficients[..., :n],
+            after.both[0],
+            fresh=own,
+            radius=self.own_radius[: own.shape[-1]],
+            rounding=self.rounding(after),
+        )
+
+    def rows(self, coefficients: Array) -> Array:
+        """A vector in terms of all symbols, ``(B, e, symbols)``; of tensors."""
+        n = self.both.shape[-1]
+        of_state, own = coefficients[..., :n] @ self.states.generators, coefficients[..., n:]
+        scaled = own * self.own_radius[: own.shape[-1]]
+        return self._m.cat([of_state, scaled.expand(len(of_state), -1, -1)], -1)
 
     def radius(self, coefficients: Array) -> Array:
-        """Sums of the magnitudes of a vector's coefficients over all symbols, ``(B, e)``, but for rounding.
-
-        In blocks of symbols that stay in the processor's cache.
-        """
-        n, count = self.generators.shape[-2:]
+        """Sums of the magnitudes of a vector's coefficients over all symbols, ``(B, e)``, but for rounding."""
+        n, generators = self.both.shape[-1], self.states.generators
         of_state, own = coefficients[..., :n], coefficients[..., n:]
-        radius = np.abs(own) @ self.own_radius[: own.shape[-1]]
-        block = max(_BLOCK // (len(self.generators) * coefficients.shape[-2]), 64)
-        for first in range(0, count, block):
-            part = of_state @ self.generators[..., first : first + block]
+        radius = abs(own) @ self.own_radius[: own.shape[-1]]
+        if not isinstance(of_state, np.ndarray):
+            return abs(of_state @ generators).sum(-1) + radius
+        block = max(_BLOCK // (len(generators) * coefficients.shape[-2]), 64)
+        for first in range(0, generators.shape[-1], block):
+            part = of_state @ generators[..., first : first + block]
             radius = radius + np.abs(part, out=part) @ _ONES[: part.shape[-1]]
         return radius
 
+    def slack(self, x: Value) -> Array:
+        """What of a radius and a centre is rounding."""
+        return x.both[1] * ((x.error + self.sum_error) * SAFETY)
+
+    def reach(self, x: Value) -> Array:
+        """Upper bounds of ``|x - centre|``, rounding included."""
+        return self.radius(x.coefficients) + self.slack(x)
+
     def bounds(self, x: Value) -> tuple[Array, Array]:
         """Lower and upper bounds, rounding included."""
-        radius = self.radius(x.coefficients) + x.both[1] * ((x.error + self.sum_error) * SAFETY)
+        radius = self.reach(x)
         return x.both[0] - radius, x.both[0] + radius
 
     def hint(self, name: str, size: int, after: Sequence[tuple[str, int]] = ()) -> Hint | None:
         """What is known of the next operation, or of the one that comes after these."""
         if self.hints is None:
             return None
-        return hint_of(self.hints, name, size, [*((r.name, r.radius.shape[-1]) for r in self.records), *after])
+        return hint_of(self.hints, name, size, [*((r.name, r.radius.shape[-1]) for r in self.relaxed), *after])
 
-    def result(self, record: Record, center: Array, magnitude: Array, coefficients: Array, factor: Array) -> Value:
-        """Note an operation: ``center + factor coefficients``, and a new variable of the record's radius per entry."""
-        self.records.append(record)
-        radius, size = record.radius, record.radius.shape[-1]
-        out = np.zeros((len(self.generators), size, self.size + size))
-        np.multiply(coefficients, factor, out=out[..., : coefficients.shape[-1]])
-        diagonal(out, self.size)[...] = radius
-        self.size += size
-        return Value(np.array([center, magnitude + radius]), out, 4 * UNIT)
-
-
-def diagonal(rows: Array, first: int) -> Array:
-    """The entries ``(i, first + i)`` of contiguous matrices ``(B, e, first + e)``, to be written."""
-    cells, size, width = rows.shape
-    return rows.reshape(cells, size * width)[:, first :: width + 1]
+    def result(self, relaxed: Relaxed, center: Array, magnitude: Array, coefficients: Array, factor: Array) -> Value:
+        """Note an operation: ``center + factor coefficients``, and a new variable of its radius per entry."""
+        self.relaxed.append(relaxed)
+        coefficients = with_fresh(coefficients, factor, self.size, relaxed.radius)
+        self.size += relaxed.radius.shape[-1]
+        return Value(self._m.stack([center, magnitude + relaxed.radius]), coefficients, BAND)
 
 
 class Bounded(NamedTuple):
@@ -155,140 +229,146 @@ def _narrowed(lower: Array, upper: Array, hint: Hint | None) -> tuple[Array, Arr
     """Bounds of an operation's input, intersected with what is known of it."""
     if hint is None or hint.lower is None or hint.upper is None:
         return lower, upper
-    return (
-        np.maximum(lower, hint.lower.reshape(lower.shape).numpy()),
-        np.minimum(upper, hint.upper.reshape(upper.shape).numpy()),
-    )
+    m = functions_of(lower)
+    return m.maximum(lower, like(hint.lower, lower)), m.minimum(upper, like(hint.upper, lower))
 
 
-def _scalar(node: Node, states: States, x: Value) -> Value:
+def _function(node: Node, frame: Frame, x: Value) -> Value:
     """A function of one variable: its band over the operand's bounds."""
-    lower, upper = _narrowed(*states.bounds(x), states.hint(node.name, node.size))
-    assert node.operation is not None
-    band = node.operation.band_of_arrays(lower, upper, *node.parameters)
-    return enclosed(node, states, Bounded(x, lower, upper, band))
+    assert node.relaxation is not None
+    name, operation, parameters = node.relaxation
+    lower, upper = _narrowed(*frame.bounds(x), frame.hint(name, node.size))
+    return enclosed(node, frame, Bounded(x, lower, upper, operation.band_of(lower, upper, *parameters)))
 
 
-def sine_and_cosine_operands(node: Node, states: States, x: Value) -> tuple[Bounded, Bounded]:
+def sine_and_cosine_operands(node: Node, after: Node, frame: Frame, x: Value) -> tuple[Bounded, Bounded]:
     """Of a sine and the cosine that follows it, or the other way round."""
-    bounds, other = states.bounds(x), "cos" if node.name == "sin" else "sin"
-    hints = states.hint(node.name, node.size), states.hint(other, node.size, [(node.name, node.size)])
+    assert node.relaxation is not None and after.relaxation is not None
+    name = node.relaxation.name
+    bounds, other = frame.bounds(x), after.relaxation.name
+    hints = frame.hint(name, node.size), frame.hint(other, node.size, [(name, node.size)])
     both = [_narrowed(*bounds, hint) for hint in hints]
-    order = 1 if node.name == "sin" else -1
+    if not isinstance(bounds[0], np.ndarray):
+        of = node.relaxation.operation, after.relaxation.operation
+        first, second = (Bounded(x, *sides, how.band_of(*sides)) for how, sides in zip(of, both, strict=True))
+        return first, second
+    order = 1 if name == "sin" else -1
     lower, upper = (np.array(side) for side in zip(*both[::order], strict=True))
     bands = sine_and_cosine_bands(lower, upper)[::order]
     first, second = (Bounded(x, *sides, band) for sides, band in zip(both, bands, strict=True))
     return first, second
 
 
-def enclosed(node: Node, states: States, operand: Bounded) -> Value:
+def enclosed(node: Node, frame: Frame, operand: Bounded) -> Value:
     """A function's result, within its band."""
+    assert node.relaxation is not None
     x, lower, upper, band, given, turn = operand
     slope, offset, radius = band
-    magnitude = np.abs(slope) * x.both[1] + np.abs(offset) + (radius + TINY)
-    radius = radius * SAFETY + magnitude * ((x.error + 4 * UNIT) * SAFETY)
-    record = Record(node.name, band, radius, states.size, x, lower, upper, node, given=given, turn=turn)
-    return states.result(record, x.both[0] * slope + offset, magnitude, x.coefficients, slope[..., None])
+    magnitude = abs(slope) * x.both[1] + abs(offset) + (radius + TINY)
+    radius = radius * SAFETY + magnitude * ((x.error + BAND) * SAFETY)
+    relaxed = Relaxed(node.relaxation.name, band, radius, frame.size, x, lower, upper, node, given=given, turn=turn)
+    return frame.result(relaxed, x.both[0] * slope + offset, magnitude, x.coefficients, slope[..., None])
 
 
-def _product(node: Node, states: States, operands: Value) -> Value:
-    """The product of the first half of the entries and the second.
-
-    ``(c + X)(d + Y) = c d + c Y + d X + X Y`` and ``X Y = (P^2 - M^2) / 4``: see ``_product`` of
-    :mod:`~sagemp_cli.reachability.affine.operations`, which this is for arrays.
+def _ends(frame: Frame, operands: Value, size: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Of two vectors X and Y one after the other: radii of both, ``l = sqrt(r_Y / r_X)``, and bounds of
+    ``|l X + Y / l|`` and ``|l X - Y / l|``. The scale is a constant for autograd.
     """
-    size, error = node.size, operands.error
-    gx, gy = operands.coefficients[:, :size], operands.coefficients[:, size:]
+    m, arrays = functions_of(operands.both), isinstance(operands.both, np.ndarray)
     # Rounding of the sums, and of scaling (3 more units) is within twice the usual slack.
-    slack = operands.both[1] * (2 * (error + states.sum_error) * SAFETY)
-    radius = states.radius(operands.coefficients) + slack
+    slack = frame.slack(operands) * 2.0
+    # Tensors are better summed from one product with the generators, arrays in blocks.
+    parts = operands.coefficients if arrays else frame.rows(operands.coefficients)
+    radius = (frame.radius(parts) if arrays else abs(parts).sum(-1)) + slack
     radius_x, radius_y = radius[:, :size], radius[:, size:]
-    ratio = np.sqrt(radius_y / radius_x)
-    x, y = gx * ratio[..., None], gy / ratio[..., None]
+    with constant(radius):
+        ratio = m.sqrt(radius_y / radius_x)
+    x, y = parts[:, :size] * ratio[..., None], parts[:, size:] / ratio[..., None]
     doubt = (slack[:, :size] * ratio + slack[:, size:] / ratio) * SAFETY
-    ends = states.radius(np.concatenate([x + y, x - y], axis=-2))
-    plus, minus = ends[:, :size] + doubt, ends[:, size:] + doubt
+    both = m.cat([x + y, x - y], -2)
+    ends = frame.radius(both) if arrays else abs(both).sum(-1)
+    return radius_x, radius_y, ratio, ends[:, :size] + doubt, ends[:, size:] + doubt
+
+
+def _product(node: Node, frame: Frame, operands: Value) -> Value:
+    """The product of the first half of the entries and the second, whose deviations may be correlated.
+
+    ``(c + X)(d + Y) = c d + c Y + d X + X Y`` and, with ``P = l X + Y / l`` and ``M = l X - Y / l`` for any l > 0,
+    ``X Y = (P^2 - M^2) / 4`` lies in ``[-r_M^2 / 4, r_P^2 / 4]``: equal to the usual ``r_X r_Y`` for independent
+    operands, up to half as wide for correlated ones (exact for a square). Best is ``l = sqrt(r_Y / r_X)``.
+    """
+    m, size, error = functions_of(operands.both), node.size, operands.error
+    gx, gy = operands.coefficients[:, :size], operands.coefficients[:, size:]
+    radius_x, radius_y, ratio, plus, minus = _ends(frame, operands, size)
     high, low = plus * plus * 0.25, minus * minus * 0.25
     middle, half = 0.5 * (high - low), 0.5 * (high + low)
     (c, mx), (d, my) = operands.both[..., :size], operands.both[..., size:]
-    magnitude = np.abs(c) * my + np.abs(d) * mx + half + TINY  # |c| my >= |c d|, and half >= |middle|
+    magnitude = abs(c) * my + abs(d) * mx + half + TINY  # |c| my >= |c d|, and half >= |middle|
     center, coefficients = c * d + middle, c[..., None] * gy + d[..., None] * gx
-    record = Record(
+    relaxed = Relaxed(
         "product",
         Band(ratio, middle, half),
-        half * SAFETY + magnitude * ((2 * error + 16 * UNIT) * SAFETY),
-        states.size,
-        Value(np.array([center, magnitude]), coefficients, error),
-        factors=(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my),
+        half * SAFETY + magnitude * (of_product(error) * SAFETY),
+        frame.size,
+        Value(m.stack([center, magnitude]), coefficients, error),
+        factors=Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my),
     )
-    return states.result(record, center, magnitude, coefficients, _ONE)
+    return frame.result(relaxed, center, magnitude, coefficients, 1.0)
 
 
-def _quotient(node: Node, states: States, operands: Value) -> Value:
+def _quotient(node: Node, frame: Frame, operands: Value) -> Value:
     """``a / b = q + (a - q b) (1 / b)`` for any q: near the centres' quotient what the two share cancels before."""
-    size = node.size
+    m, size = functions_of(operands.both), node.size
     (a, size_a), (b, size_b), reciprocal = (operands.both[..., i * size : (i + 1) * size] for i in range(3))
     of_a, of_b, rest = (operands.coefficients[:, i * size : (i + 1) * size] for i in range(3))
-    q = np.nan_to_num(a / b, nan=0.0, posinf=0.0, neginf=0.0)
-    difference = np.array([a - q * b, size_a + np.abs(q) * size_b + TINY])
+    with constant(a):
+        q = m.nan_to_num(a / b, nan=0.0, posinf=0.0, neginf=0.0)
+    difference = m.stack([a - q * b, size_a + abs(q) * size_b + TINY])
     factors = Value(
-        np.concatenate([difference, reciprocal], axis=-1),
-        np.concatenate([of_a - q[..., None] * of_b, rest], axis=-2),
-        operands.error + 2 * UNIT,
+        m.cat([difference, reciprocal], -1),
+        m.cat([of_a - q[..., None] * of_b, rest], -2),
+        operands.error + SHIFT,
     )
-    product = _product(node, states, factors)
-    return Value(product.both + np.array([q, np.abs(q)]), product.coefficients, product.error + 2 * UNIT)
+    product = _product(node, frame, factors)
+    return Value(product.both + m.stack([q, abs(q)]), product.coefficients, product.error + SHIFT)
 
 
-def _angle(node: Node, states: States, operands: Value) -> Value:
+def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     """The angle of a point, of its distance across a direction in the middle of its angles."""
-    assert node.operation is not None
-    size, hint = node.size, states.hint(node.name, node.size)
-    lower, upper = states.bounds(operands)
-    low, high = on_tensors(
-        _arctangent2.value_range,
-        *(
-            np.ascontiguousarray(a)
-            for side in (slice(size), slice(size, None))
-            for a in (lower[:, side], upper[:, side])
-        ),
-    )
+    assert node.relaxation is not None
+    m, size, hint = functions_of(operands.both), node.size, frame.hint("atan2", node.size)
+    lower, upper = frame.bounds(operands)
+    sides = (lower[:, :size], upper[:, :size], lower[:, size:], upper[:, size:])
+    low, high = on_tensors(_arctangent2.value_range, *map(contiguous, sides))
     if hint is None or hint.turn is None:
         turn = on_tensors(_arctangent2.turn, low, high)
     else:
-        turn = Turn(*(part.reshape(low.shape).numpy() for part in hint.turn))
+        turn = Turn(*(like(part, low) for part in hint.turn))
     c, s, angle = turn
     (y, size_y), (x, size_x) = operands.both[..., :size], operands.both[..., size:]
     gy, gx = operands.coefficients[:, :size], operands.coefficients[:, size:]
-    magnitude = [np.abs(c) * size_y + np.abs(s) * size_x + TINY, np.abs(c) * size_x + np.abs(s) * size_y + TINY]
+    magnitude = [abs(c) * size_y + abs(s) * size_x + TINY, abs(c) * size_x + abs(s) * size_y + TINY]
     turned = Value(
-        np.concatenate([np.array([c * y - s * x, magnitude[0]]), np.array([c * x + s * y, magnitude[1]])], axis=-1),
-        np.concatenate([c[..., None] * gy - s[..., None] * gx, c[..., None] * gx + s[..., None] * gy], axis=-2),
-        operands.error + 2 * UNIT,
+        m.cat([m.stack([c * y - s * x, magnitude[0]]), m.stack([c * x + s * y, magnitude[1]])], -1),
+        m.cat([c[..., None] * gy - s[..., None] * gx, c[..., None] * gx + s[..., None] * gy], -2),
+        operands.error + SHIFT,
     )
-    lower, upper = states.bounds(turned)
-    radius = states.radius(turned.coefficients) + turned.both[1] * ((turned.error + states.sum_error) * SAFETY)
-    ratio = np.sqrt(radius[:, size:] / radius[:, :size])
-    v, u = turned.coefficients[:, :size] * ratio[..., None], turned.coefficients[:, size:] / ratio[..., None]
-    # Rounding of the sums, and of scaling (3 more units each) is within twice the usual slack.
-    slack = turned.both[1] * (2 * (turned.error + states.sum_error) * SAFETY)
-    doubt = (slack[:, :size] * ratio + slack[:, size:] / ratio) * SAFETY
-    ends = states.radius(np.concatenate([v + u, v - u], axis=-2))
-    (center, middle), bounds = np.split(turned.both[0], 2, axis=-1), (lower[:, size:], upper[:, size:])
-    twist = _arctangent2.twist(center, radius[:, size:], ends[:, :size] + doubt, ends[:, size:] + doubt)
-    given = (*bounds, middle, *twist, angle, low, high)
+    lower, upper = frame.bounds(turned)
+    _, radius, _, plus, minus = _ends(frame, turned, size)
+    center, middle = turned.both[0][:, :size], turned.both[0][:, size:]
+    twist = _arctangent2.twist(center, radius, plus, minus)
+    given = (lower[:, size:], upper[:, size:], middle, *twist, angle, low, high)
     across = Value(turned.both[..., :size], turned.coefficients[:, :size], turned.error)
     lower, upper = _narrowed(lower[:, :size], upper[:, :size], hint)
-    band = node.operation.band_of_arrays(lower, upper, *given)
-    return enclosed(node, states, Bounded(across, lower, upper, band, given, turn))
+    band = node.relaxation.operation.band_of(lower, upper, *given)
+    return enclosed(node, frame, Bounded(across, lower, upper, band, given, turn))
 
 
 _BLOCK = 2**16
-"""Entries of an array that stays in the cache."""
+"""Entries of an array that stays in the processor's cache."""
 _ONES = np.ones(_BLOCK)
-_ONE = np.ones(1)
-EVALUATE: dict[str, Callable[[Node, States, Value], Value]] = {
-    "scalar": _scalar,
+EVALUATE: dict[str, Callable[[Node, Frame, Value], Value]] = {
+    "function": _function,
     "product": _product,
     "quotient": _quotient,
     "angle": _angle,

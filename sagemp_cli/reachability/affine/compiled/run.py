@@ -1,187 +1,126 @@
-"""Forward affine arithmetic on arrays: what :class:`~.affine.affine.Affine` does to a foldable loop.
+"""Forward affine arithmetic over the steps of a recorded loop.
 
-The enclosures are those of :mod:`sagemp_cli.reachability.affine.form`, with the same variables in the same order, the
-same account of rounding and the same records. But all that is linear between two nonlinear operations is one matrix
-product (:mod:`.affine.compiled.folding`), and arrays take the place of tensors: on the few numbers of a step an
-operation of numpy costs a fifth of one of torch. Not differentiable.
+All that is linear between two nonlinear operations is one matrix product (:mod:`.affine.compiled.folding`); what the
+nonlinear ones do is in :mod:`.affine.compiled.operations`. On arrays; on tensors where the tube is differentiated, by
+constants of the loop's programs, its numbers or the sets.
 
-Of float64 arrays is used that sums and products are correctly rounded, in whatever order a sum of products is taken,
-with or without fused multiply-add.
+Of float64 arithmetic is used that sums and products are correctly rounded, in whatever order a sum of products is
+taken, with or without fused multiply-add.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine.boxed import Boxed
-from sagemp_cli.reachability.affine.compiled.foldable_loop import FoldableLoop, NotFoldable
-from sagemp_cli.reachability.affine.compiled.folding import Combination, Node, Plan, plan_of
+from sagemp_cli.reachability.affine.compiled.arrays import added, repeated
+from sagemp_cli.reachability.affine.compiled.folding import Combination, Compiled, Node, compiled
+from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints
 from sagemp_cli.reachability.affine.compiled.operations import (
     EVALUATE,
     Bounded,
-    States,
+    Frame,
     Value,
-    diagonal,
     enclosed,
     sine_and_cosine_operands,
 )
-from sagemp_cli.reachability.affine.compiled.steps import KeptStep, forms_of
-from sagemp_cli.reachability.affine.form import SAFETY, AffineForm, Hints
-from sagemp_cli.reachability.interval.operands import sharper
-from sagemp_cli.reachability.recording import recorded_bands
-from sagemp_cli.reachability.relaxations.band import Band
-from sagemp_cli.sets import Box, Tube
-from sagemp_cli.sets.order_reduction import reduce_arrays
-from sagemp_cli.sets.rounding import TINY, UNIT
+from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.interval.operands import operands, sharper
+from sagemp_cli.reachability.program.loops import RecordedLoop
+from sagemp_cli.reachability.program.program import Program
+from sagemp_cli.reachability.relaxations.functions import functions_of
+from sagemp_cli.sets import Box
+from sagemp_cli.sets.rounding import TINY, combined
+from sagemp_cli.sets.zonotope import Zonotope
 
-Array = np.ndarray
-
-
-@dataclass
-class PlannedRun:
-    """What a forward pass found: see :class:`~sagemp_cli.reachability.affine.affine.AffineRun`.
-
-    Attributes:
-        controls: per step, bounds of the control; empty unless asked for.
-    """
-
-    tube: Tube
-    bands: list[list[tuple[str, Band]]]
-    kept: list[Tensor]
-    steps: list[AffineForm]
-    controls: list[tuple[Tensor, Tensor]]
-    notes: tuple[str, ...] = ()
+Array = np.ndarray | Tensor
 
 
-@torch.no_grad()
-@np.errstate(all="ignore")  # what overflows has infinite bounds
-def planned_run(
-    loop: FoldableLoop,
-    start: Box,
-    disturbance: Box,
-    steps: int,
-    *,
-    symbols: int | None,
-    hints: Sequence[Hints] | None,
-    keep_steps: bool,
-    watch: bool,
-) -> PlannedRun:
-    """Propagate a start box ``(*batch, n)``.
+class Steps:
+    """The steps of a recorded loop, compiled, with their numbers and the disturbance.
 
     Args:
-        loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
-        steps: how many.
-        symbols: most generators kept between steps (None: all that are not negligible).
-        hints: per step, bounds of the operations' inputs that are known to hold.
-        keep_steps: keep every step's form, for a backward pass.
-        watch: bound the controls.
-
-    Raises:
-        NotFoldable: the loop has no plan, or references of a larger batch than the start box.
+        loop: what steps.
+        disturbance: W.
+        cells: shape of the batch of cells; the loop's own batch broadcasts to it.
+        tensors: whether to compute with tensors.
     """
-    batch, n = start.lower.shape[:-1], start.dim
-    plan = _Prepared(loop, steps, batch, n, disturbance)
 
-    def in_batch(array: Array) -> Tensor:
-        return torch.from_numpy(array).reshape((*batch, *array.shape[1:]))
+    def __init__(self, loop: RecordedLoop, disturbance: Box, cells: torch.Size, *, tensors: bool) -> None:
+        numbers = loop.numbers_in(cells) if len(loop.batch) else loop.numbers[:, None]
+        self._numbers = numbers.flatten(1, -2)
+        self._disturbance, self._tensors = disturbance, tensors
+        self._ready = [_Ready(p, self._numbers, disturbance, tensors=tensors) for p in loop.programs]
 
-    low, high = (side.reshape(-1, n).numpy() for side in (start.lower, start.upper))
-    center, reach = (side.reshape(-1, n).numpy() for side in (start.center, start.radius))
-    generators = reach[:, :, None] * np.eye(n)
-    lowers, uppers, found = [low], [high], PlannedRun(Tube(start.lower, start.upper), [], [], [], [])
-    kept_steps, again, boxed = [], 0, Boxed(symbols)
-    for k in range(steps):
-        known = None if hints is None else hints[k]
-        states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
-        after, control = plan.step(k, states)
-        lost = np.isfinite(reach).all(-1) & ~np.isfinite(after.both).all((0, 2))
-        if lost.any():  # an operation's domain was left: intervals may know better
-            box = in_batch(lowers[-1]), in_batch(uppers[-1])
-            known = sharper(plan.step_on_sets(k), box, disturbance, known, where=in_batch(lost))
-            states = States(center, reach, generators, inputs=plan.inputs, own_radius=plan.own_radius, hints=known)
-            after, control = plan.step(k, states)
-        kept = (pair for r in states.records for pair in recorded_bands(r.name, r.band, r.turn))
-        found.bands.append([(name, Band(*map(in_batch, band))) for name, band in kept])
-        if watch and control is not None:
-            found.controls.append(tuple(map(in_batch, states.bounds(control))))
-        if keep_steps:
-            kept_steps.append(KeptStep.of(states, after))
-        center, generators = after.both[0], states.rows(after.coefficients, extra=n)
-        diagonal(generators, generators.shape[-1] - n)[...] = after.both[1] * (
-            (after.error + (2 * n + 16) * UNIT) * SAFETY
-        )
-        every, count, mask = generators, generators.shape[-1], None
-        if count > (again if symbols is None else max(symbols, n + 1)):
-            generators, mask = reduce_arrays(generators, symbols)
-            again = max(generators.shape[-1] * 5 // 4, generators.shape[-1] + 64)
-        if mask is None:
-            found.kept.append(torch.ones(count, dtype=torch.bool))
-        else:
-            found.kept.append(torch.from_numpy(mask) if mask.ndim == 1 else in_batch(mask))
-        boxed.follow(every, mask)
-        reach = np.add.reduce(np.abs(generators), axis=-1) * (1.0 + 2 * (generators.shape[-1] + 8) * UNIT)
-        spread = reach * (1.0 + 2 * UNIT) + np.abs(center) * (2 * UNIT)
-        lowers.append(center - spread)
-        uppers.append(center + spread)
-        if not math.isfinite(reach.sum()):
-            bad = ~np.isfinite(reach).all(-1)
-            lowers[-1][bad], uppers[-1][bad] = -math.inf, math.inf
-            center[bad], generators[bad], reach[bad] = math.nan, math.nan, math.nan
-    found.notes = boxed.notes()
-    found.steps += forms_of(kept_steps, batch, disturbance.radius)
-    found.tube = Tube(*(in_batch(np.stack(side, axis=1)) for side in (lowers, uppers)))
-    return found
+    def evaluate(self, k: int, states: Zonotope, hints: Hints | None) -> tuple[Frame, Value, Value | None]:
+        """Step k from a set: its frame, the next state, and control and deviation if the loop says them."""
+        ready = self._of(k)
+        frame = Frame(states, inputs=ready.inputs, own_radius=ready.own_radius, hints=hints)
+        after, watched = ready.evaluate(k, frame)
+        if not math.isfinite(after.both.sum().item()):
+            m = functions_of(after.both)
+            lost = m.isfinite(states.reach).all(-1) & ~m.isfinite(after.both).all(0).all(-1)
+            if bool(lost.any()):  # an operation's domain was left: intervals may know better
+                known = sharper(self._operands(k, states), hints, where=torch.as_tensor(lost))
+                frame = Frame(states, inputs=ready.inputs, own_radius=ready.own_radius, hints=known)
+                after, watched = ready.evaluate(k, frame)
+        return frame, after, watched
+
+    def _operands(self, k: int, states: Zonotope) -> list[Hint]:
+        """What intervals know of step k's operations."""
+        low, high = (torch.as_tensor(side).detach() for side in (states.low, states.high))
+        numbers = self._numbers[k].detach()
+        given = ((low, high), (self._disturbance.lower, self._disturbance.upper), (numbers, numbers))
+        with torch.no_grad():
+            return operands(self._of(k).program, *(IntervalForm(*sides) for sides in given))
+
+    def _of(self, k: int) -> _Ready:
+        return self._ready[k if len(self._ready) > 1 else 0]
 
 
-class _Prepared:
-    """A plan with its numbers."""
+class _Ready:
+    """One program, compiled, with the numbers of all steps."""
 
-    def __init__(self, loop: FoldableLoop, steps: int, batch: torch.Size, n: int, disturbance: Box) -> None:
-        self._loop = loop
-        given = torch.stack([loop.given(k) for k in range(steps)]).to(torch.float64)
-        own = given.shape[1 : given.dim() - loop.given_dim]
-        shape = given.shape[1 + len(own) :]
-        if len(own) > len(batch) or np.broadcast_shapes(own, batch) != batch:
-            raise NotFoldable
-        plan = plan_of(loop, shape, n, disturbance.dim)
-        if len(own):
-            given = given.reshape(steps, *[1] * (len(batch) - len(own)), *given.shape[1:]).expand(steps, *batch, *shape)
-        given = given.reshape(steps, math.prod(batch) if len(own) else 1, math.prod(shape))
-        self.inputs = n + disturbance.dim
-        entries = sum(node.size for node in plan.nodes)
-        self.own_radius = np.concatenate([disturbance.radius.numpy(), np.ones(entries)])
-        self._nodes = [(node, _Fold(plan, node.operands, given, disturbance)) for node in plan.nodes]
-        self._pairs = _pairs(plan.nodes)
-        self._state = _Fold(plan, plan.state, given, disturbance)
-        self._control = None if plan.control is None else _Fold(plan, plan.control, given, disturbance)
+    def __init__(self, program: Program, numbers: Tensor, disturbance: Box, *, tensors: bool) -> None:
+        self.program = program
+        step = compiled(program)
+        self.inputs = step.states + step.disturbances
+        ones = disturbance.radius.new_ones(sum(node.size for node in step.nodes))
+        self.own_radius = _placed(torch.cat([disturbance.radius, ones]), tensors)
 
-    def step_on_sets(self, k: int) -> Callable[[Any, Any], Any]:
-        """The step as it is, on value types."""
-        return lambda x, w: self._loop.step_given(self._loop.given(k), x, w)
+        def fold(combination: Combination) -> _Fold:
+            return _Fold(step, combination, numbers, disturbance, tensors=tensors)
 
-    def step(self, k: int, states: States) -> tuple[Value, Value | None]:
-        """The next state, and the control if the loop has one."""
+        self._nodes = [(node, fold(node.operands)) for node in step.nodes]
+        self._pairs = _pairs(step.nodes)
+        self._next = fold(step.outputs.next)
+        self._watched = None if step.watched is None else fold(step.watched)
+
+    def evaluate(self, k: int, frame: Frame) -> tuple[Value, Value | None]:
         results: list[Value] = []
         known: list[Bounded] = []  # of a function whose turn is next
         for i, (node, fold) in enumerate(self._nodes):
             if known:
-                results.append(enclosed(node, states, known.pop()))
+                results.append(enclosed(node, frame, known.pop()))
             elif i in self._pairs:
-                first, second = sine_and_cosine_operands(node, states, fold(k, states, results))
-                results.append(enclosed(node, states, first))
+                after, _ = self._nodes[i + 1]
+                first, second = sine_and_cosine_operands(node, after, frame, fold(k, frame, results))
+                results.append(enclosed(node, frame, first))
                 known.append(second)
             else:
-                results.append(EVALUATE[node.kind](node, states, fold(k, states, results)))
-        control = None if self._control is None else self._control(k, states, results)
-        return self._state(k, states, results), control
+                results.append(EVALUATE[node.rule](node, frame, fold(k, frame, results)))
+        watched = None if self._watched is None else self._watched(k, frame, results)
+        return self._next(k, frame, results), watched
+
+
+def _placed(tensor: Tensor, tensors: bool) -> Array:
+    return tensor if tensors else tensor.detach().numpy()
 
 
 def _pairs(nodes: Sequence[Node]) -> set[int]:
@@ -193,67 +132,67 @@ def _pairs(nodes: Sequence[Node]) -> set[int]:
             return False
         return torch.equal(a.matrix, b.matrix[:, :width]) and torch.equal(a.sizes, b.sizes[:, :width])
 
+    def name(node: Node) -> str:
+        return "" if node.relaxation is None else node.relaxation.name
+
     return {
         i
         for i, (a, b) in enumerate(itertools.pairwise(nodes))
-        if {a.name, b.name} == {"sin", "cos"} and same(a.operands, b.operands)
+        if {name(a), name(b)} == {"sin", "cos"} and same(a.operands, b.operands)
     }
 
 
 class _Fold:
-    """A combination, ready for one propagation: what the given numbers and the disturbance's centre contribute to the
+    """A combination, ready for one propagation: what the step's numbers and the disturbance's centre contribute to the
     constants is known for all steps.
     """
 
-    def __init__(self, plan: Plan, combination: Combination, given: Tensor, disturbance: Box) -> None:
+    def __init__(
+        self, step: Compiled, combination: Combination, numbers: Tensor, disturbance: Box, *, tensors: bool
+    ) -> None:
         linear = torch.nn.functional.linear
-        matrix, sizes = (plan.split(side.detach()) for side in combination[:2])
+        matrix, sizes = (step.split(side) for side in combination[:2])
         used = [bool(part.any()) for part in sizes]
         w = disturbance.center
         constant = matrix[0][:, 0] + linear(w, matrix[3])
         size = sizes[0][:, 0] + linear(w.abs() + disturbance.radius + TINY, sizes[3]) + TINY
         self._varies = used[1]
         if used[1]:
-            constant, size = constant + linear(given, matrix[1]), size + linear(given.abs(), sizes[1])
-            self._constant = torch.stack([constant, size], dim=1).numpy()
+            constant, size = constant + linear(numbers, matrix[1]), size + linear(numbers.abs(), sizes[1])
+            self._constant = _placed(torch.stack([constant, size], dim=1), tensors)
         else:
-            self._constant = torch.stack([constant, size])[:, None].numpy()
+            self._constant = _placed(torch.stack([constant, size])[:, None], tensors)
 
         def sided(i: int) -> Array:
-            return torch.stack([matrix[i].mT, sizes[i].mT]).contiguous().numpy()
+            return _placed(torch.stack([matrix[i].mT, sizes[i].mT]).contiguous(), tensors)
 
         self._of_state = sided(2) if used[2] else None
         self._of_results = [
-            (i - 4, matrix[i].contiguous().numpy(), sided(i)) for i in range(len(used) - 1, 3, -1) if used[i]
+            (i - 4, _placed(matrix[i].contiguous(), tensors), sided(i)) for i in range(len(used) - 1, 3, -1) if used[i]
         ]
         # Coefficients of state and disturbance; results are taken the latest first, which has most variables.
-        self._direct: Array | None = None
+        self._direct: Any = None
         if used[3]:
-            self._direct = torch.cat([matrix[2], matrix[3]], dim=-1)[None].numpy()
+            self._direct = _placed(torch.cat([matrix[2], matrix[3]], dim=-1)[None], tensors)
         elif used[2] or not self._of_results:
-            self._direct = matrix[2].contiguous()[None].numpy()
+            self._direct = _placed(matrix[2].contiguous()[None], tensors)
         length = sum(part.shape[-1] for part, some in zip(matrix, used, strict=True) if some)
-        self._error = combination.error + (length + 8) * UNIT
+        self._error = combination.error + combined(length)
 
-    def __call__(self, k: int, states: States, results: Sequence[Value]) -> Value:
+    def __call__(self, k: int, frame: Frame, results: Sequence[Value]) -> Value:
         """The combination at step k."""
         both = self._constant[k] if self._varies else self._constant
         if self._of_state is not None:
-            both = both + states.both @ self._of_state
+            both = both + frame.both @ self._of_state
         coefficients, error = None, 0.0
         for i, matrix, sided in self._of_results:
-            result = results[i]
-            both = both + result.both @ sided
-            error = max(error, result.error)
-            part = matrix @ result.coefficients
-            if coefficients is None:
-                coefficients = part
-            else:
-                coefficients[..., : part.shape[-1]] += part
+            both = both + results[i].both @ sided
+            error = max(error, results[i].error)
+            coefficients = added(coefficients, matrix @ results[i].coefficients)
         if coefficients is None:
             coefficients = self._direct
         elif self._direct is not None:
-            coefficients[..., : self._direct.shape[-1]] += self._direct
-        if both.shape[1] != states.both.shape[1]:
-            both = np.repeat(both, states.both.shape[1], axis=1)
+            coefficients = added(coefficients, self._direct)
+        if both.shape[1] != frame.both.shape[1]:
+            both = repeated(both, frame.both.shape[1], axis=1)
         return Value(both, coefficients, self._error + error)

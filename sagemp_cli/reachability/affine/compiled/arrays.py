@@ -1,0 +1,58 @@
+"""The few things that arrays and tensors do differently: what arrays do in place is made anew of tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def with_fresh(coefficients: Any, factor: Any, size: int, radius: Any) -> Any:
+    """``factor * coefficients`` as coefficients of ``size`` variables, and one more variable of that radius per entry.
+
+    Args:
+        coefficients: ``(B, e, variables)`` or ``(1, e, variables)``.
+        factor: a number, or ``(B, e, 1)``.
+        size: at least as many as there are variables.
+        radius: ``(B, e)``.
+    """
+    cells, entries = radius.shape
+    if not isinstance(radius, np.ndarray):
+        scaled = (coefficients * factor).expand(cells, -1, -1)
+        return torch.cat(
+            [torch.nn.functional.pad(scaled, (0, size - scaled.shape[-1])), torch.diag_embed(radius)], dim=-1
+        )
+    out = np.zeros((cells, entries, size + entries))
+    np.multiply(coefficients, factor, out=out[..., : coefficients.shape[-1]])
+    out.reshape(cells, -1)[:, size :: size + entries + 1] = radius
+    return out
+
+
+def added(total: Any, part: Any) -> Any:
+    """The sum of coefficients, of which the second may have fewer variables; the first is used up."""
+    if total is None:
+        return part
+    if isinstance(total, np.ndarray):
+        total[..., : part.shape[-1]] += part
+        return total
+    return total + torch.nn.functional.pad(part, (0, total.shape[-1] - part.shape[-1]))
+
+
+def repeated(x: Any, count: int, axis: int = 0) -> Any:
+    """One entry along an axis as so many."""
+    if isinstance(x, Tensor):
+        return x.expand(*x.shape[:axis], count, *x.shape[axis + 1 :])
+    return np.repeat(x, count, axis=axis)
+
+
+def like(tensor: Tensor, x: Any) -> Any:
+    """A tensor in the shape of the other, as an array if that is one."""
+    shaped = tensor.reshape(x.shape)
+    return shaped if isinstance(x, Tensor) else shaped.numpy()
+
+
+def contiguous(x: Any) -> Any:
+    """The same with its entries side by side."""
+    return x.contiguous() if isinstance(x, Tensor) else np.ascontiguousarray(x)
