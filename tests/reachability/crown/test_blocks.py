@@ -30,8 +30,8 @@ def loops():
 def test_a_few_cells_and_steps_at_a_time_give_the_same_tube(propagator, name, monkeypatch):
     loop, cells = loops()[name], partition(START, [2, 1, 1, 1])
     whole = propagator.propagate(loop, cells, DISTURBANCE)
-    calls, ready = [], steps_module.compiled
-    monkeypatch.setattr(steps_module, "compiled", lambda some: calls.append(len(some)) or ready(some))
+    calls, ready = [], steps_module.ready
+    monkeypatch.setattr(steps_module, "ready", lambda some: calls.append(len(some)) or ready(some))
     monkeypatch.setattr(crown_module, "AT_ONCE", 1)
     monkeypatch.setattr(steps_module, "BLOCK", 1)
     monkeypatch.setattr(steps_module, "KEPT", 0)
