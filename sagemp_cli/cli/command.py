@@ -13,6 +13,9 @@ from typer.core import TyperCommand, TyperGroup
 
 from sagemp_cli.errors import EXIT_ERROR, EXIT_INTERRUPTED, SagempError
 
+_WrongCall: Any = typer.BadParameter.__mro__[1]
+"""The framework's own error of a call that it does not understand; it has no public name."""
+
 
 class _Ending:
     """Errors reach the user as one line and an exit code of :mod:`sagemp_cli.errors`.
@@ -24,8 +27,8 @@ class _Ending:
         """Run the command and turn whatever it raises into a line and an exit code."""
         try:
             return super().invoke(ctx)  # type: ignore[misc]
-        except typer.Exit:
-            raise
+        except (typer.Exit, _WrongCall):
+            raise  # of an unknown command or option: the framework says it better, with exit code 2
         except SagempError as e:
             _complain(f"error: {e}")
             code = e.exit_code
