@@ -1,51 +1,30 @@
-"""Certificates of anybody's loop: no reference, no robot of ours, with and without a scene, differing steps, angles."""
+"""Certificates of anybody's loop: no reference and no robot of ours, a scene or none, angles, several programs."""
 
 import pytest
 import torch
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.checker.claim import claim_rows, equation_lines
-from sagemp_cli.pipeline.own_loop import LoopProof, certificate_of
-from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.program.loops import recorded
 from sagemp_cli.sets import Box
-from sagemp_cli.sets.partition import partition
-from sagemp_cli.storage import Header, write_artifact
+from sagemp_cli.stages.prove import prove
 
 START, W = Box.around([1.0, 0.2], [0.1, 0.1]), Box.around([0.0], [0.01])
+STEP = "data/loop/programs"
 
 
-class Loop:
-    """A step of one's own, which may depend on its number."""
-
-    state_dim = 2
-
-    def __init__(self, step, horizon=4):
-        self.step, self.horizon = step, horizon
-
-
-def turn(k, x, w):
+def turn(x, w):
     """A vehicle that turns towards the origin."""
     angle = torch.atan2(x[..., 1], x[..., 0])
     return torch.stack([x[..., 0] - 0.1 * torch.cos(angle), x[..., 1] - 0.1 * torch.sin(angle) + w[..., 0]], dim=-1)
 
 
-def shrink(k, x, w):
+def shrink(x, w):
     return torch.stack([0.9 * x[..., 0] + 0.1 * w[..., 0], 0.8 * x[..., 1] * x[..., 0]], dim=-1)
 
 
-def in_turns(k, x, w):
-    return shrink(k, x, w) if k % 2 else torch.cat([x[..., :1] * 0.9, torch.tanh(x[..., 1:])], dim=-1) + w * 0.1
-
-
 def certificate(path, step, **options):
-    loop = recorded(Loop(step), START, W)
-    cells = partition(START, [2, 1])
-    with torch.no_grad():
-        run = Affine().run(loop, cells, W)
-    proof = LoopProof(loop, START, W, cells, run.tube, run.recording(), "affine", True)
-    record, config = certificate_of(proof, **options)
-    return write_artifact(path, record, Header(stage="prove", experiment="own", config=config))
+    prove(step, start=START, disturbance=W, horizon=4, partitions=[2, 1], restarts=1, certificate=path, **options)
+    return path
 
 
 @pytest.mark.parametrize("step", [turn, shrink])
@@ -58,23 +37,6 @@ def test_that_a_loop_stays_in_its_tube_is_proved_without_a_scene(step, tmp_path)
     assert equation_lines(report.document)[-1].startswith("x1' = ")
 
 
-def test_a_loop_whose_steps_differ_has_a_program_for_each(tmp_path):
-    report = check(certificate(tmp_path / "own.h5", in_turns))
-    assert report.answer == "VERIFIED", (report.problems, report.findings)
-    assert report.document.step_program.tolist() == [0, 1, 2, 3] and report.document.lookahead == 0
-    lines = equation_lines(report.document)
-    assert lines[0] == "steps 0:" and any("tanh(x1)" in line for line in lines)
-
-
-def test_a_loop_whose_steps_change_places_is_another_loop(mutate, tmp_path):
-    source = certificate(tmp_path / "own.h5", in_turns)
-
-    def change(file):
-        file["data/loop/step_program"][()] = [1, 0, 3, 2]
-
-    assert check(mutate(source, tmp_path / "mutant.h5", change)).answer == "UNKNOWN"
-
-
 SCENE = {
     "workspace": {"lower": [-2.0, -2.0], "upper": [2.0, 2.0]},
     "obstacles": [{"kind": "ball", "name": "tree", "center": [0.9, 1.0], "radius": 0.3}],
@@ -83,17 +45,16 @@ SCENE = {
 
 
 def test_a_scene_and_a_goal_are_proved_as_well(tmp_path):
-    path = certificate(tmp_path / "own.h5", turn, scene=SCENE, position=(0, 1), state_names=("east", "north"), dt=0.5)
-    report = check(path)
+    report = check(certificate(tmp_path / "own.h5", turn, scene=SCENE, state_names=("east", "north"), dt=0.5))
     assert report.answer == "VERIFIED", (report.problems, report.findings)
     assert report.findings[0].clearance["tree"] > 0.1
     assert dict(claim_rows(report.document))["goal at K"] == "east 0.3 to 0.9, north -1 to 1"
 
 
-def test_an_obstacle_in_the_way_is_not_passed(tmp_path):
+def test_an_obstacle_in_the_way_is_proved_to_be_hit(tmp_path):
     scene = SCENE | {"obstacles": [{"kind": "ball", "name": "tree", "center": [0.9, 0.2], "radius": 0.3}]}
-    report = check(certificate(tmp_path / "own.h5", turn, scene=scene, position=(0, 1)))
-    assert report.answer == "UNKNOWN" and report.findings[0].claimed == "MAY_COLLIDE"
+    report = check(certificate(tmp_path / "own.h5", turn, scene=scene))
+    assert report.answer == "FALSIFIED" and report.counterexamples == ((0, ""),)
 
 
 def test_the_direction_of_an_angle_is_not_believed(mutate, tmp_path):
@@ -105,3 +66,20 @@ def test_the_direction_of_an_angle_is_not_believed(mutate, tmp_path):
 
     report = check(mutate(source, tmp_path / "mutant.h5", change))
     assert report.answer == "UNKNOWN" and "'atan2'" in report.findings[0].reason
+
+
+def test_a_loop_may_have_several_programs_and_each_step_is_its_own(mutate, tmp_path):
+    source = certificate(tmp_path / "own.h5", shrink)
+
+    def twice(file, factor=1.0):
+        file.copy(f"{STEP}/000000", f"{STEP}/000001")
+        file[STEP].attrs["count"] = 2
+        numbers = file[f"{STEP}/000001/numbers"]
+        numbers[numbers[()] == 0.9] = 0.9 * factor
+        file["data/loop/step_program"][()] = [0, 1, 0, 1]
+
+    report = check(mutate(source, tmp_path / "same.h5", twice))
+    assert report.answer == "VERIFIED"
+    assert "steps 1, 3:" in equation_lines(report.document)
+    other = check(mutate(source, tmp_path / "other.h5", lambda file: twice(file, 1.2)))
+    assert other.answer == "UNKNOWN" and other.findings[0].reason.startswith("cell 0, step 1:")
