@@ -23,7 +23,7 @@ class _Ending:
     ``SAGEMP_DEBUG=1`` shows the traceback as well.
     """
 
-    def invoke(self, ctx: typer.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Run the command and turn whatever it raises into a line and an exit code."""
         try:
             return super().invoke(ctx)  # type: ignore[misc]

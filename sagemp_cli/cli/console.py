@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -24,8 +24,8 @@ LINE_EVERY_SECONDS = 5.0
 
 def console_progress(stream: TextIO | None = None) -> Progress:
     """Bars if ``stream`` (stderr by default) is a terminal, plain lines otherwise."""
-    stream = sys.stderr if stream is None else stream
-    return TerminalProgress(stream) if stream.isatty() else PlainProgress(stream)
+    out: TextIO = sys.stderr if stream is None else stream
+    return TerminalProgress(out) if out.isatty() else PlainProgress(out)
 
 
 class TerminalProgress:
@@ -74,7 +74,8 @@ class _Bar:
         self._bars, self._task = bars, task
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        self._bars.update(self._task, advance=steps, **({"note": note} if note else {}))
+        fields: dict[str, Any] = {"note": note} if note else {}
+        self._bars.update(self._task, advance=steps, **fields)
 
 
 class PlainProgress:

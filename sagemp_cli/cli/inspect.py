@@ -133,8 +133,8 @@ def _fields(record: Any, prefix: str) -> list[dict[str, str]]:
                 {"name": f"{name}/{k}", "holds": f"{w.dtype} {tuple(w.shape)}", "dims": "", "units": "", "doc": ""}
                 for k, w in (value or {}).items()
             ]
-        if meta["form"] == "group":
-            items = value if meta["many"] else () if value is None else (value,)
+        if meta["form"] == "group" and value is not None:
+            items = value if meta["many"] else (value,)
             for i, item in enumerate(items):
                 rows += _fields(item, f"{name}/{f'{i:06d}/' if meta['many'] else ''}")
     return rows

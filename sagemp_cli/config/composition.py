@@ -10,7 +10,7 @@ import functools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, cast
 
 import yaml
 
@@ -220,7 +220,7 @@ def _alone(group: str, option: str) -> Mapping[str, Any]:
 
     found = OmegaConf.to_container(_hydra([], name=f"{group}/{option}"), resolve=False)
     assert isinstance(found, dict)
-    return found
+    return cast("dict[str, Any]", found)
 
 
 def _composed(overrides: Sequence[str]) -> dict[str, Any]:
@@ -233,7 +233,7 @@ def _composed(overrides: Sequence[str]) -> dict[str, Any]:
     except OmegaConfBaseException as e:
         raise ConfigError(f"config: {_first_line(e)}") from None
     assert isinstance(config, dict)
-    return config
+    return cast("dict[str, Any]", config)
 
 
 def _hydra(overrides: Sequence[str], *, with_hydra: bool = False, name: str = _ROOT) -> Any:
@@ -300,7 +300,7 @@ def _is_group(key: str) -> bool:
     return any((folder / key).is_dir() for folder in config_folders())
 
 
-def _is_file(choice: Any) -> bool:
+def _is_file(choice: Any) -> TypeGuard[str]:
     return isinstance(choice, str) and choice.endswith((".yaml", ".yml"))
 
 
@@ -315,7 +315,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _is_numbers(value: Any) -> bool:
+def _is_numbers(value: Any) -> TypeGuard[list[Any]]:
     return isinstance(value, list) and bool(value) and all(_is_number(v) for v in value)
 
 

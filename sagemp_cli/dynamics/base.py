@@ -63,7 +63,7 @@ class Dynamics(nn.Module):
         if disturbance not in DISTURBANCE_READINGS:
             raise ConfigError(f"{name}: disturbance must be one of {DISTURBANCE_READINGS}, found '{disturbance}'")
         self.dt = float(dt)
-        self.disturbance = disturbance
+        self.disturbance: Literal["derivative", "state"] = disturbance
         for key, values, size in (
             ("control_lower", control_lower, self.control_dim),
             ("control_upper", control_upper, self.control_dim),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -17,7 +17,7 @@ _expert: Expert | None = None  # a worker's own copy, sent once when it starts
 
 def solve_problems(
     problems: Sequence[PlannedDemonstration], expert: Expert, *, processes: int = 2, done: Collection[int] = ()
-) -> Iterator[Demonstration]:
+) -> Generator[Demonstration, None, None]:
     """Solve all problems whose index is not in ``done``; yields in the order in which they finish.
 
     A demonstration depends on its problem and the expert alone, so neither the order nor the number of processes nor
@@ -39,7 +39,7 @@ def solve_problems(
     return _solve([problem for problem in problems if problem.index not in done], expert, processes)
 
 
-def _solve(todo: list[PlannedDemonstration], expert: Expert, processes: int) -> Iterator[Demonstration]:
+def _solve(todo: list[PlannedDemonstration], expert: Expert, processes: int) -> Generator[Demonstration, None, None]:
     if processes == 0:
         for problem in todo:
             yield solve_problem(problem, expert)

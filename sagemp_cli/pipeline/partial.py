@@ -74,7 +74,7 @@ class PartialResults:
         temporary = self.folder / f"{index:06d}.{os.getpid()}.tmp"
         try:
             with temporary.open("wb") as f:
-                np.savez(f, **arrays)
+                np.savez(f, **arrays)  # pyright: ignore[reportArgumentType]  (declared with a flag beside the arrays)
             os.replace(temporary, self._path(index))
         except OSError as e:
             temporary.unlink(missing_ok=True)

@@ -72,7 +72,7 @@ class ConfigOptions:
 
 
 _SECTIONS = tuple(
-    f.name for f in fields(ConfigOptions) if f.type not in ("str", "Whole", "Count") and "None" not in f.type
+    f.name for f in fields(ConfigOptions) if f.type not in ("str", "Whole", "Count") and "None" not in str(f.type)
 )
 
 

@@ -41,13 +41,14 @@ class TimeMLP(nn.Module):
     def reset(self, generator: torch.Generator) -> None:
         """Draw new weights: uniform within ``1 / sqrt(inputs)`` of a layer, the last layer a tenth of that."""
         inputs = self.time.in_features + self.first.in_features
-        for layer in (self.time, self.first, *self.rest):
+        rest = [layer for layer in self.rest if isinstance(layer, nn.Linear)]
+        for layer in (self.time, self.first, *rest):
             shared = layer is self.time or layer is self.first
             bound = (inputs if shared else layer.in_features) ** -0.5
             for parameter in layer.parameters():
                 parameter.uniform_(-bound, bound, generator=generator)
-        self.rest[-1].weight.mul_(0.1)
-        self.rest[-1].bias.zero_()
+        rest[-1].weight.mul_(0.1)
+        rest[-1].bias.zero_()
 
     def embed(self, t: Tensor) -> Tensor:
         """The time's part of the first layer, ``(...)`` to ``(..., h)``.

@@ -64,11 +64,14 @@ class TemporalNetwork(nn.Module):
             if isinstance(layer, nn.Linear | nn.Conv2d):
                 bound = layer.weight[0].numel() ** -0.5
                 layer.weight.uniform_(-bound, bound, generator=generator)
+                assert layer.bias is not None
                 layer.bias.zero_()
             elif isinstance(layer, nn.LayerNorm):
                 layer.weight.fill_(1.0)
                 layer.bias.zero_()
-        self.leave[-1].weight.mul_(0.1)
+        last = self.leave[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.mul_(0.1)
 
     def forward(self, x: Tensor, t: Tensor, condition: Tensor) -> Tensor:
         """The answer for sequences ``(B, T, inputs)``, generative times ``(B,)`` in [0, 1] and vectors ``(B, c)``."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Collection, Iterable
+from typing import Any, cast
 
 import h5py
 import numpy as np
+from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  (a compiled module without a stub)
 
 from sagemp_cli.reading.budget import Budget, RefusedError
 from sagemp_cli.reading.tree import Dataset, Group
@@ -56,28 +57,34 @@ def _group(node: h5py.Group, budget: Budget, level: int, without: Collection[str
     if level > MOST_LEVELS:
         raise RefusedError(f"groups are nested deeper than {MOST_LEVELS} levels")
     members: dict[str, Group | Dataset] = {}
-    for name in node:
+    for name in cast("Iterable[str]", node):
         found = _member(node, name)
         if name in without and isinstance(found, h5py.Group):
-            members[name] = Group(found.name, {})
+            members[name] = Group(_path(found), {})
         elif isinstance(found, h5py.Dataset):
-            _require_own(found, found.name)
-            members[name] = Dataset(found.name, _value(found, found.name, budget, _MOST_TEXTS), _attrs(found, budget))
+            where = _path(found)
+            _require_own(found, where)
+            members[name] = Dataset(where, _value(found, where, budget, _MOST_TEXTS), _attrs(found, budget))
         elif isinstance(found, h5py.Group):
             members[name] = _group(found, budget, level + 1, ())
         else:
             raise RefusedError(f"{found.name} is neither a group nor a dataset")
-    return Group(node.name, members, _attrs(node, budget))
+    return Group(_path(node), members, _attrs(node, budget))
+
+
+def _path(node: h5py.Group | h5py.Dataset) -> str:
+    assert isinstance(node.name, str)
+    return node.name
 
 
 def _member(node: h5py.Group, name: str) -> Any:
-    where = f"{node.name.rstrip('/')}/{name}"
+    where = f"{_path(node).rstrip('/')}/{name}"
     if not _is_text(name):
         raise RefusedError(f"a name in {node.name} is not UTF-8")
     if not isinstance(node.get(name, getlink=True), h5py.HardLink):
         raise RefusedError(f"{where} is a link; a file must hold all of its data itself")
     found = node[name]
-    if h5py.h5o.get_info(found.id).rc != 1:
+    if h5o.get_info(found.id).rc != 1:
         raise RefusedError(f"an object in it has several names ({where} is one)")
     return found
 

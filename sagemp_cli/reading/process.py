@@ -7,7 +7,8 @@ import os
 import signal
 import stat
 import sys
-from typing import Any, BinaryIO
+from io import BufferedReader
+from typing import Any
 
 import h5py
 import numpy as np
@@ -24,6 +25,7 @@ _MARGIN = 2**26
 def main() -> None:
     """Answer requests on stdin until it ends."""
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    assert isinstance(requests, BufferedReader)
     os.dup2(2, 1)  # what a library prints is no answer
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the caller's, who ends this process
     while True:
@@ -49,7 +51,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         return {"refused": f"{request['damaged']} ({' '.join(str(e).split())[:500] or type(e).__name__})"}
 
 
-def open_regular(path: str) -> BinaryIO:
+def open_regular(path: str) -> BufferedReader:
     """Open a file for reading, without waiting for whoever writes into a pipe.
 
     Raises:
@@ -64,7 +66,7 @@ def open_regular(path: str) -> BinaryIO:
     return file
 
 
-def _read(request: dict[str, Any], file: BinaryIO, budget: Budget) -> dict[str, Any]:
+def _read(request: dict[str, Any], file: BufferedReader, budget: Budget) -> dict[str, Any]:
     wanted = request.get("wanted")
     match request["format"]:
         case "npz":
@@ -85,7 +87,7 @@ def _read(request: dict[str, Any], file: BinaryIO, budget: Budget) -> dict[str, 
 class _hdf5:
     """The same file opened by the HDF5 library, which only takes names; one that was replaced meanwhile is refused."""
 
-    def __init__(self, path: str, file: BinaryIO) -> None:
+    def __init__(self, path: str, file: BufferedReader) -> None:
         self._before, self._path = os.fstat(file.fileno()), path
         self._file = h5py.File(path, "r", locking="best-effort")
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Collection
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,8 @@ def read_arrays(path: Path, wanted: Collection[str] | None = None) -> tuple[list
     Raises:
         ArtifactError: as :func:`read_tree`; or one that is wanted is no array of numbers.
     """
-    request = {"format": "npz" if path.suffix.lower() == ".npz" else "arrays"}
-    request["wanted"] = None if wanted is None else list(wanted)
+    form = "npz" if path.suffix.lower() == ".npz" else "arrays"
+    request = {"format": form, "wanted": None if wanted is None else list(wanted)}
     found = _asked(path, request, what="a file", damaged="cannot be read")
     return found["names"], found["arrays"]
 
@@ -102,7 +103,7 @@ class _Reader:
         """Its answer; or the exit code with which it ended instead."""
         with self._lock:
             process = self._running()
-            assert process.stdin is not None and process.stdout is not None
+            assert process.stdin is not None and isinstance(process.stdout, BufferedReader)
             watch = threading.Timer(seconds, process.kill)
             watch.daemon = True
             watch.start()

@@ -60,6 +60,20 @@ class Group(Mapping[str, "Group | Dataset"]):
             return found[rest]
         raise KeyError(path)
 
+    def group(self, path: str) -> Group:
+        """The group of that path; TypeError if it is none."""
+        found = self[path]
+        if not isinstance(found, Group):
+            raise TypeError(f"{found.name} must be a group")
+        return found
+
+    def dataset(self, path: str) -> Dataset:
+        """The dataset of that path; TypeError if it is none."""
+        found = self[path]
+        if not isinstance(found, Dataset):
+            raise TypeError(f"{found.name} must be a dataset")
+        return found
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.members)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, BinaryIO
+from typing import IO, Any, Protocol
 
 import numpy as np
 
@@ -13,18 +13,26 @@ from sagemp_cli.reading.tree import Dataset, Group
 _LENGTH = 8
 
 
-def send(stream: BinaryIO, message: Mapping[str, Any]) -> None:
+class Readable(Protocol):
+    """What a message is read from."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None:
+        """Fill the beginning of the buffer; how much of it, 0 at the end."""
+        ...
+
+
+def send(stream: IO[bytes], message: Mapping[str, Any]) -> None:
     """Write a message: a mapping of plain data, arrays, groups and datasets, to any depth."""
     arrays: list[np.ndarray] = []
     text = json.dumps(_plain(message, arrays)).encode()
     stream.write(len(text).to_bytes(_LENGTH, "little"))
     stream.write(text)
     for array in arrays:
-        stream.write(memoryview(_bytes(array)))
+        stream.write(_bytes(array))
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> Any:
+def receive(stream: Readable) -> Any:
     """Read a message.
 
     Raises:
@@ -77,22 +85,22 @@ def _restored(data: dict[str, Any], fill: Callable[[np.ndarray], None]) -> Any:
     return data["plain"]
 
 
-def _fill(stream: BinaryIO, array: np.ndarray) -> None:
-    _read_into(stream, memoryview(_bytes(array)))
+def _fill(stream: Readable, array: np.ndarray) -> None:
+    _read_into(stream, _bytes(array))
 
 
-def _bytes(array: np.ndarray) -> np.ndarray:
+def _bytes(array: np.ndarray) -> memoryview:
     """The memory of a contiguous array as bytes."""
-    return array.reshape(-1).view(np.uint8) if array.nbytes else np.zeros(0, np.uint8)
+    return (array.reshape(-1).view(np.uint8) if array.nbytes else np.zeros(0, np.uint8)).data
 
 
-def _exactly(stream: BinaryIO, count: int) -> bytes:
+def _exactly(stream: Readable, count: int) -> bytes:
     data = bytearray(count)
     _read_into(stream, memoryview(data))
     return bytes(data)
 
 
-def _read_into(stream: BinaryIO, view: memoryview) -> None:
+def _read_into(stream: Readable, view: memoryview) -> None:
     while view:
         got = stream.readinto(view)
         if not got:

@@ -21,11 +21,10 @@ DOT = 0.05
 """Radius of the dots at start and goal, in the picture's units."""
 
 Image = NDArray[np.uint8]
+Place = Sequence[float] | NDArray[np.floating]
 
 
-def render(
-    scene: Scene, frame: Frame, *, start: Sequence[float], goal: Sequence[float], height: int, dots: bool = True
-) -> Image:
+def render(scene: Scene, frame: Frame, *, start: Place, goal: Place, height: int, dots: bool = True) -> Image:
     """The scene from above, ``(height, width, 3)``: floor, landmarks, obstacles; green dot at start, red one at goal.
 
     Edges are smoothed over one pixel, so a picture of a few dozen pixels, for a small network, shows the same as a

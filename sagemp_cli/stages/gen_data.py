@@ -81,7 +81,7 @@ def _record(found: Sequence[dict[str, np.ndarray]], dimension: int) -> Demonstra
         states=np.stack([item["states"] for _, item in solved]),
         controls=np.stack([item["controls"] for _, item in solved]),
         problem=np.array([index for index, _ in solved], dtype=np.int64),
-        side=tuple(side_label(item["sides"], dimension) for _, item in solved),
+        side=tuple(side_label(item["sides"].tolist(), dimension) for _, item in solved),
         iterations=np.array([item["iterations"] for _, item in solved], dtype=np.int64),
         seconds=np.array([item["seconds"] for _, item in solved]),
         failed=tuple(failed),

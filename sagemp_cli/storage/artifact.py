@@ -212,11 +212,12 @@ def _read_header(file: Group, path: Path) -> tuple[Kind, Header]:
         raise ArtifactError(f"{path}: format {version} of '{kind.name}' is an old one; make it again: {kind.command}")
     if "data" not in file:
         raise ArtifactError(f"{path}: group /data is missing")
-    config = plain_yaml(_text(file["config"][()]))
+    config = plain_yaml(_text(file.dataset("config")[()]))
     if not isinstance(config, dict):
         raise ArtifactError(f"{path}: /config must be a mapping, found {type(config).__name__}")
     parents = tuple(
-        Parent(role, _text(node.attrs["path"]), _text(node.attrs["sha256"])) for role, node in file["parents"].items()
+        Parent(role, _text(node.attrs["path"]), _text(node.attrs["sha256"]))
+        for role, node in file.group("parents").items()
     )
     a = file.attrs
     header = Header(

@@ -64,7 +64,8 @@ def group(record: type, doc: str, *, many: bool = False, optional: bool = False)
 
 def _declare(form: str, doc: str, **metadata: Any) -> Any:
     metadata = {"form": form, "doc": doc, "optional": False, **metadata}
-    return dataclasses.field(metadata=metadata, **({"default": None} if metadata["optional"] else {}))
+    default: dict[str, Any] = {"default": None} if metadata["optional"] else {}
+    return dataclasses.field(metadata=metadata, **default)
 
 
 def write_record(node: h5py.Group, record: Any) -> None:

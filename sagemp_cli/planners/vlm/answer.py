@@ -61,6 +61,7 @@ def waypoints_of(answer: str, frame: Frame, *, most: int = MOST_WAYPOINTS) -> ND
     except ValidationError as e:
         first = e.errors()[0]
         j, *entry = first["loc"][1:]
+        assert isinstance(j, int)
         if len(entry) != 1 or first["type"] == "missing":
             point = points[j]
             raise AnswerError(f"waypoints[{j}] must be two numbers [x, y], found {_short(point)}") from None
@@ -73,7 +74,8 @@ def waypoints_of(answer: str, frame: Frame, *, most: int = MOST_WAYPOINTS) -> ND
         raise AnswerError(f"the answer lists {len(found)} waypoints, at most {most} are allowed")
     low, high = np.array([frame.x[0], frame.y[0]]), np.array([frame.x[1], frame.y[1]])
     _refuse_outside(found, low, high, "image")
-    _refuse_outside(found, *frame.to_image(np.array(frame.workspace)), "workspace")
+    low, high = frame.to_image(np.array(frame.workspace))
+    _refuse_outside(found, low, high, "workspace")
     return found
 
 

@@ -72,10 +72,11 @@ def answers_to(
         images = torch.from_numpy(np.stack([picture(scene, frame, reader.pixels) for scene, frame, _ in part]))
         maps.append(torch.sigmoid(reader(images, torch.stack([bag_of_words(text) for _, _, text in part]))[0]))
     seen = torch.cat(maps).double().numpy()
-    return [
-        waypoints_on(*seen[looked_at[id(scene), text]], start, goal, temperature=temperature, rng=rng)
-        for scene, _, text, start, goal in asked
-    ]
+    found = []
+    for scene, _, text, start, goal in asked:
+        blocked, over = seen[looked_at[id(scene), text]]
+        found.append(waypoints_on(blocked, over, start, goal, temperature=temperature, rng=rng))
+    return found
 
 
 def answer_figures(reader: SceneReader, exercises: Sequence[Exercise], *, seed: int) -> dict[str, float]:

@@ -22,6 +22,8 @@ class SceneReader(nn.Module):
         channels: of the finest features.
     """
 
+    places: Tensor
+
     def __init__(self, *, pixels: int = 48, channels: int = 16) -> None:
         super().__init__()
         if pixels < 16 or pixels % 8 or channels < 4 or channels % 4:
@@ -48,11 +50,13 @@ class SceneReader(nn.Module):
             if isinstance(layer, nn.Conv2d | nn.Linear):
                 bound = (3.0 / layer.weight[0].numel()) ** 0.5
                 layer.weight.uniform_(-bound, bound, generator=generator)
+                assert layer.bias is not None
                 layer.bias.zero_()
             elif isinstance(layer, nn.GroupNorm):
                 layer.reset_parameters()
-        self.maps.bias.fill_(-2.0)  # most of a scene is free floor
-        self.names.bias.fill_(-2.0)
+        for layer in (self.maps, self.names):  # most of a scene is free floor
+            assert layer.bias is not None
+            layer.bias.fill_(-2.0)
 
     def forward(self, images: Tensor, words: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of two maps ``(B, 2, h, h)``: must not be there, told to pass over; and of each word whether it names

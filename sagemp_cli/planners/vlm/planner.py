@@ -70,16 +70,16 @@ class PracticeOptions(Schedule):
 
 
 class Provider(Protocol):
-    """What answers questions.
+    """What answers questions."""
 
-    Attributes:
-        label: what it is, for figures.
-    """
-
-    label: str
+    @property
+    def label(self) -> str:
+        """What it is, for figures."""
+        ...
 
     def answers(self, questions: Sequence[Question], *, generator: torch.Generator) -> list[str]:
         """One text per question; untrusted."""
+        ...
 
 
 class VLM(nn.Module):

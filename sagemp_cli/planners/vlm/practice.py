@@ -113,6 +113,7 @@ def practice_of(exercises: list[Exercise], *, pixels: int, margin: float) -> Pra
     names = np.full((len(exercises), *cells.shape[:2]), -1)
     for row, exercise in zip(names, exercises, strict=True):
         for thing in exercise.scene.obstacles:
+            assert isinstance(thing, Ball)
             row[near((thing,), 0.0)] = WORDS.index(thing.object or "circles")
     images = np.stack([picture(e.scene, SQUARE, pixels) for e in exercises])
     return Practice(

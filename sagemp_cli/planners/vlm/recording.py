@@ -96,8 +96,9 @@ class Replay:
             UsageError: there are no recorded answers.
         """
         recordings = self._recordings()
-        models, dates = {r.model for r in recordings} - {None}, sorted({r.date for r in recordings} - {None})
-        about = ", ".join([*sorted(models)[:3], *dates[:1]])
+        models = sorted({r.model for r in recordings if r.model is not None})
+        dates = sorted({r.date for r in recordings if r.date is not None})
+        about = ", ".join([*models[:3], *dates[:1]])
         return f"replay of {self.path.name}" + (f" ({about})" if about else "")
 
     def answers(self, questions: Sequence[Question], *, generator: torch.Generator) -> list[str]:

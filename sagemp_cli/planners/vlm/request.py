@@ -38,8 +38,9 @@ def ask_in_process(request: dict[str, Any], seconds: float) -> Outcome | None:
     # package's in the environment (another address, a log of requests) counts.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENAI_")}
     command = [sys.executable, "-P", __file__]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, env=environment, **pipes) as process:
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
         try:
             said, _ = process.communicate(json.dumps(request | {"seconds": seconds}).encode(), timeout=seconds)
         except subprocess.TimeoutExpired:
@@ -63,8 +64,9 @@ def ask(request: dict[str, Any]) -> Outcome:
     class Bounded(openai.DefaultHttpxClient):
         """Reads a reply up to a limit, undecoded (no compression was asked for); keeps what is needed of its head."""
 
-        def send(self, sent: Any, **options: Any) -> Any:
-            response = super().send(sent, **(options | {"stream": True, "follow_redirects": False}))
+        def send(self, request: Any, **options: Any) -> Any:
+            options |= {"stream": True, "follow_redirects": False}
+            response = super().send(request, **options)
             parts, size = [], 0
             try:
                 for part in response.iter_raw():
@@ -76,12 +78,12 @@ def ask(request: dict[str, Any]) -> Outcome:
                 response.close()
             kept = {name: v for name, v in response.headers.items() if name.lower() == "retry-after"}
             kept["content-type"] = "application/json"  # whatever it says of itself: it is read as JSON
-            return type(response)(response.status_code, headers=kept, content=b"".join(parts), request=sent)
+            return type(response)(response.status_code, headers=kept, content=b"".join(parts), request=request)
 
     key = request["key"]
     image = {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{request['png']}"}}
-    content = [{"type": "text", "text": request["text"]}, image]
-    seed = {} if request["seed"] is None else {"seed": request["seed"]}
+    messages: Any = [{"role": "user", "content": [{"type": "text", "text": request["text"]}, image]}]
+    seed: dict[str, Any] = {} if request["seed"] is None else {"seed": request["seed"]}
     # The package insists on a key; where there is none, none is sent.
     head = {"Accept-Encoding": "identity"} | ({} if key else {"Authorization": openai.Omit()})
     try:
@@ -90,7 +92,7 @@ def ask(request: dict[str, Any]) -> Outcome:
         ) as client:
             reply = client.chat.completions.with_raw_response.create(
                 model=request["model"],
-                messages=[{"role": "user", "content": content}],
+                messages=messages,
                 temperature=request["temperature"],
                 extra_headers=head,
                 **seed,
@@ -150,7 +152,8 @@ def _answer(text: str) -> Outcome:
         return {"wrong": f"the reply is not a JSON object, found {type(reply).__name__}"}
     choices = reply.get("choices")
     choice = choices[0] if isinstance(choices, list) and choices else None
-    message = choice.get("message") if isinstance(choice, dict) else None
+    choice = choice if isinstance(choice, dict) else {}
+    message = choice.get("message")
     if not isinstance(message, dict):
         keys = ", ".join(reply)[:60] or "nothing"
         return {"wrong": f"the reply is not what the protocol says (choices[0].message), found {keys}"}
@@ -158,8 +161,9 @@ def _answer(text: str) -> Outcome:
     if isinstance(refusal, str) and refusal:
         return {"answer": f"refused by the model: cannot answer ({refusal})"}
     if isinstance(content, list):  # some servers give the text in parts
-        texts = [part.get("text", "") if isinstance(part, dict) else None for part in content]
-        content = "".join(texts) if all(isinstance(part, str) for part in texts) else content
+        parts = [part.get("text", "") if isinstance(part, dict) else None for part in content]
+        texts = [part for part in parts if isinstance(part, str)]
+        content = "".join(texts) if len(texts) == len(parts) else content
     if content is None and ended == "content_filter":
         return {"answer": "refused by the service: cannot answer (content_filter)"}
     if content is not None and not isinstance(content, str):

@@ -36,7 +36,8 @@ def waypoints_on(
         rng: source of the preference.
     """
     wall, target = np.clip(_finer(blocked), 0.0, 1.0), _middle(_finer(over))
-    for _ in range(TRIES):
+    tries = 0
+    while True:
         taste = np.exp(temperature * _finer(rng.normal(size=(NOISE_CELLS, NOISE_CELLS)), order=3))
         cost = (1.0 + BLOCKED_COST * wall) * taste
         to = _straightened(_cheapest(cost, start, goal if target is None else target), wall)
@@ -45,16 +46,17 @@ def waypoints_on(
         on = _straightened(_cheapest(cost, target, goal), wall)
         way = np.stack([start, *to, target, *on, goal])
         before, after = np.diff(way[len(to) : len(to) + 3], axis=0)
-        if before @ after > SHARPEST * np.linalg.norm(before) * np.linalg.norm(after):
-            break
-    return way[1:-1]
+        tries += 1
+        if tries == TRIES or before @ after > SHARPEST * np.linalg.norm(before) * np.linalg.norm(after):
+            return way[1:-1]
 
 
 def _finer(coarse: Array, order: int = 1) -> Array:
     """A map on the search grid; values are those of cells, at their middles."""
-    fine = zoom(np.asarray(coarse, dtype=np.float64), SIDE / len(coarse), order=order, mode="nearest", grid_mode=True)
+    exact = np.asarray(coarse, dtype=np.float64)
+    fine = zoom(exact, SIDE / len(coarse), order=order, mode="nearest", grid_mode=True)
     assert fine.shape == (SIDE, SIDE)
-    return fine
+    return np.asarray(fine, dtype=np.float64)
 
 
 def _middle(over: Array) -> Array | None:

@@ -68,10 +68,10 @@ def reference_of(places: Array, start: Array, *, horizon: int, dt: float, drive:
     heading[moving] = np.arctan2(steps[moving, 1], steps[moving, 0])
     for k in np.flatnonzero(~moving):
         heading[k] = heading[k - 1] if k else float(start[2])
-    heading = np.unwrap(np.concatenate([[start[2]], heading]))[1:]
+    heading = np.unwrap(np.concatenate([start[2:3], heading]))[1:].astype(np.float64)
     reference = np.concatenate([positions, np.append(heading, heading[-1])[:, None]], axis=1)
     if len(start) > 3:
-        speed = np.linalg.norm(steps, axis=1) / dt
+        speed = np.asarray(np.linalg.norm(steps, axis=1) / dt, dtype=np.float64)
         reference = np.concatenate([reference, np.append(speed, speed[-1])[:, None]], axis=1)
     reference[0] = start
     return reference
@@ -126,7 +126,7 @@ def _travelled(length: float, first: float, *, horizon: int, dt: float, ramp: fl
     ramp = min(ramp, total)
     cruise = (length - 0.5 * ramp * first) / (total - 0.5 * ramp)
     if cruise < 0 or ramp == 0:  # the ramp alone goes too far: no ramp then
-        return length * seconds / total
+        return np.asarray(length * seconds / total, dtype=np.float64)
     rising = np.minimum(seconds, ramp)
     gone = first * rising + 0.5 * (cruise - first) * rising**2 / ramp + cruise * (seconds - rising)
     return np.minimum(gone, length)
