@@ -108,7 +108,7 @@ def applies(example: Mapping[str, Any], document: Document) -> bool:
     tubes = document.tubes
     _, rows, n = tubes["tube_lower"].shape
     states, w, reference = (example.get(key) for key in ("states", "disturbances", "reference"))
-    return (
+    return bool(
         isinstance(states, np.ndarray)
         and isinstance(w, np.ndarray)
         and states.shape == (rows, n)

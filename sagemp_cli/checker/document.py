@@ -130,41 +130,44 @@ def _read(file: Group, path: Path) -> Document:
         raise ArtifactError(f"{path}: has no content hash; make it again with this version of sagemp")
     if content_hash(file) != stored:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
-    config = _config(file["config"][()])
-    data = file["data"]
+    config = _config(file.dataset("config")[()])
+    data = file.group("data")
     _require_known(data, "tubes", "loop", "counterexamples", "true_model", "samples", *_REJECTED)
-    examples = data.get("counterexamples", {})
-    tubes = _tubes(data["tubes"], path)
+    examples = data.group("counterexamples") if "counterexamples" in data else Group("/data/counterexamples", {})
+    tubes = _tubes(data.group("tubes"), path)
     _, rows, n = tubes["tubes"]["tube_lower"].shape
     d = len(tubes["tubes"]["disturbance_lower"])
-    loop = _loop(data["loop"], n, d, rows - 1)
+    loop = _loop(data.group("loop"), n, d, rows - 1)
     document = Document(
         kind=schema.removeprefix("sagemp/"),
         config=config,
         said={name: _plain(file.attrs[name]) for name in _SAID if name in file.attrs}
         | tubes.pop("said")
-        | {f"further plans {name}": _plain(data["samples"].attrs[name]) for name in _SAMPLES if "samples" in data},
+        | {
+            f"further plans {name}": _plain(data.group("samples").attrs[name]) for name in _SAMPLES if "samples" in data
+        },
         **tubes,
         **loop,
         **_problem(config, n, d, loop, path),
         verdict=str(data.attrs.get("verdict", "")),
         counterexamples=tuple(
-            {**examples[name].attrs, **{key: _dataset(d) for key, d in examples[name].items()}} for name in examples
+            {**example.attrs, **{key: _dataset(example.dataset(key)) for key in example}}
+            for example in map(examples.group, examples)
         ),
     )
     _require_fitting(document, path)
     if "true_model" not in data:
         return document
-    true = _tubes(data["true_model/tubes"], path)
+    true = _tubes(data.group("true_model/tubes"), path)
     true.pop("said")
-    program = _program(data["true_model/program"], n, d, document.lookahead * n)
+    program = _program(data.group("true_model/program"), n, d, document.lookahead * n)
+    deviation = _dataset(data.dataset("true_model/deviation"))
     true = dataclasses.replace(
-        document, **true, programs=(program,), step_program=np.zeros(document.horizon, np.int64),
-        deviation=_dataset(data["true_model/deviation"]),
-    )  # fmt: skip
+        document, **true, programs=(program,), step_program=np.zeros(document.horizon, np.int64), deviation=deviation
+    )
     _require_fitting(true, path)
     wanted = (len(true.tubes["verdict"]), true.horizon, n)
-    if true.deviation.shape != wanted or true.deviation.dtype != np.float64 or program.deviation < 0:
+    if deviation.shape != wanted or deviation.dtype != np.float64 or program.deviation < 0:
         raise ArtifactError(
             f"{path}: /data/true_model needs a program with a deviation, and float64 bounds of shape {wanted}"
         )
@@ -187,11 +190,11 @@ def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
     lookahead = int(group.attrs["lookahead"])
     if not 0 <= lookahead <= _MOST_LOOKAHEAD:
         raise ValueError(f"/data/loop: lookahead is {lookahead}")
-    programs = group["programs"]
-    made = tuple(_program(programs[name], n, d, lookahead * n) for name in sorted(programs))
+    programs = group.group("programs")
+    made = tuple(_program(programs.group(name), n, d, lookahead * n) for name in sorted(programs))
     if not made:
         raise ValueError("/data/loop needs a program")
-    which, position = _dataset(group["step_program"]), _dataset(group["position"])
+    which, position = _dataset(group.dataset("step_program")), _dataset(group.dataset("position"))
     if which.shape != (steps,) or not np.isin(which, np.arange(len(made))).all() or which.dtype != np.int64:
         raise ValueError(f"/data/loop/step_program must be {steps} numbers of its {len(made)} programs")
     if position.ndim != 1 or position.dtype != np.int64 or not np.isin(position, np.arange(n)).all():
@@ -201,7 +204,7 @@ def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
     m = made[0].controls
     if any(program.controls != m for program in made):
         raise ValueError("/data/loop: its programs have different numbers of controls")
-    names = {name: tuple(_dataset(group[name])) for name in _NAMES}
+    names = {name: tuple(_dataset(group.dataset(name))) for name in _NAMES}
     longest = max((len(text) for texts in names.values() for text in texts), default=0)
     if [len(v) for v in names.values()] != [n, n, m, m] or longest > _LONGEST_NAME:
         raise ValueError(f"/data/loop must name {n} states and {m} controls and their units, in short words")
@@ -238,7 +241,7 @@ def _program(group: Group, n: int, d: int, g: int) -> Program:
     """A program as stored; instruction i has the parts ``begin[i]..begin[i+1]`` of each list."""
     lists = (("operands", "operand_begin"), ("numbers", "number_begin"), ("indices", "index_begin"))
     _require_known(group, "kinds", "sizes", "outputs", *(name for pair in lists for name in pair))
-    kinds = _dataset(group["kinds"])
+    kinds = _dataset(group.dataset("kinds"))
     parts = [
         _parts(group, name, begin, np.float64 if name == "numbers" else np.int64, len(kinds)) for name, begin in lists
     ]
@@ -246,7 +249,7 @@ def _program(group: Group, n: int, d: int, g: int) -> Program:
         Instruction(kind, tuple(reads.tolist()), constants, entries)
         for kind, reads, constants, entries in zip(kinds, *parts, strict=True)
     ]
-    outputs = _dataset(group["outputs"])
+    outputs = _dataset(group.dataset("outputs"))
     if outputs.shape != (3,) or outputs.dtype != np.int64:
         raise ValueError(f"{group.name}/outputs must be three slots")
     named = zip(("next", "control", "deviation"), outputs.tolist(), strict=True)
@@ -259,13 +262,13 @@ def _program(group: Group, n: int, d: int, g: int) -> Program:
         instructions, {name: slot for name, slot in named if slot != -1 or name == "next"},
         states=n, disturbances=d, numbers=g,
     )  # fmt: skip
-    if _dataset(group["sizes"]).tolist() != list(program.widths):
+    if _dataset(group.dataset("sizes")).tolist() != list(program.widths):
         raise ValueError(f"{group.name}/sizes are not those of its instructions' results")
     return program
 
 
 def _parts(group: Group, name: str, begin: str, kind: type, count: int) -> list[np.ndarray]:
-    values, ends = _dataset(group[name]), _dataset(group[begin])
+    values, ends = _dataset(group.dataset(name)), _dataset(group.dataset(begin))
     if values.ndim != 1 or values.dtype != kind or ends.shape != (count + 1,) or ends.dtype != np.int64:
         raise ValueError(f"{group.name}/{name} must be a list of {kind.__name__} with {count + 1} places in {begin}")
     if ends[0] != 0 or ends[-1] != len(values) or (np.diff(ends) < 0).any():
@@ -289,13 +292,14 @@ def _config(text: str) -> Any:
 def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
     """What a group of tubes holds, as fields of a :class:`Document`."""
     _require_known(tubes, "references", "relaxations", *_SHAPES, *_TEXTS)
-    read = {name: _dataset(tubes[name]) for name in tubes if isinstance(tubes[name], Dataset)}
+    read = {name: _dataset(tubes.dataset(name)) for name in tubes if isinstance(tubes[name], Dataset)}
     read.setdefault("references", None)
     _require_shapes(read, path)
     relaxations = {}
     if "relaxations" in tubes:
-        _require_known(tubes["relaxations"], "slope", "offset", "radius", "kept")
-        relaxations = {name: _dataset(node) for name, node in tubes["relaxations"].items()}
+        recorded = tubes.group("relaxations")
+        _require_known(recorded, "slope", "offset", "radius", "kept")
+        relaxations = {name: _dataset(recorded.dataset(name)) for name in recorded}
     return {
         "tubes": read,
         "said": {name: _plain(tubes.attrs[name]) for name in ("propagator", "rigorous")},

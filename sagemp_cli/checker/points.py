@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+
 from sagemp_cli.checker.balls import arb, balls
 from sagemp_cli.checker.functions import Function, clamp, function_of
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
@@ -56,7 +58,7 @@ def functions_of(instruction: Instruction, width: int) -> list[Function]:
     return [function_of(instruction.kind, constants)] * width
 
 
-def _linear(constants: Sequence[float], operand: Point) -> Point:
+def _linear(constants: np.ndarray, operand: Point) -> Point:
     columns = len(operand)
     rows = len(constants) // (columns + 1)
     weights, bias = balls(constants[: rows * columns]), balls(constants[rows * columns :])

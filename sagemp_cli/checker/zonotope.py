@@ -12,7 +12,7 @@ balls: ``c + a (x - center) + b [-1, 1]^q``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -41,7 +41,7 @@ class Zonotope:
             raise Unproved("a bound overflowed")
 
     @classmethod
-    def box(cls, lower: Sequence[float], upper: Sequence[float]) -> Zonotope:
+    def box(cls, lower: Iterable[float], upper: Iterable[float]) -> Zonotope:
         """One that contains a box: the box itself up to rounding of its radii."""
         low, high = balls(lower), balls(upper)
         center = [((a + b) / 2).mid() for a, b in zip(low, high, strict=True)]

@@ -135,7 +135,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "experiment": certificate.header.experiment,
         "stand_in": stand_in(certificate.header.config) or None,
         "holds": "at the samples",
-        "horizon": int(tubes.references.shape[1] - 1),
+        "horizon": int(tubes.tube_lower.shape[1] - 1),
         "propagator": tubes.propagator,
         "rigorous": tubes.rigorous,
         "checkable": tubes.relaxations is not None,

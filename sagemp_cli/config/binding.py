@@ -16,7 +16,7 @@ import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from types import SimpleNamespace, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from pydantic import AfterValidator, AllowInfNan, BaseModel, ConfigDict, Field, Strict, ValidationError, create_model
 from pydantic_core import PydanticUndefined
@@ -230,7 +230,7 @@ def _bound(
     bound = _keywords(checked)
     if is_dataclass(function) and not given and not wrong:  # what it says itself, of several options together
         try:
-            function(**bound)
+            cast("Callable[..., Any]", function)(**bound)
         except UsageError as e:
             wrong.append(str(e) if str(e).startswith(where) else f"{where}: {e}")
     return bound, wrong
@@ -324,7 +324,7 @@ def _sentences(error: ValidationError, model: type[BaseModel], options: Any, whe
             near = did_you_mean(key, fields) or f"; known: {', '.join(fields) or 'none'}"
             yield f"{full}: {name} has no such option{near}" if name else f"{full}: no such option{near}"
         elif found["type"] == "value_error":
-            yield str(found["ctx"]["error"])
+            yield str(found.get("ctx", {})["error"])
         elif inner is not None:
             yield f"{full} must be a section, found {_short(value)}; its keys: {', '.join(_options_of(inner))}"
         else:

@@ -58,7 +58,7 @@ def planner_from(artifact: Artifact[PlannerModel]) -> StoredPlanner:
     config = artifact.header.config
     arguments = _arguments(artifact.record.arguments, artifact)
     try:
-        section, horizon = config.get("planner"), config.get("horizon")
+        section, horizon = config.get("planner", {}), config.get("horizon")
         if hasattr(target_class(section, "planner"), "learns_from"):
             module = build({**arguments, NAME: section[NAME]}, "planner")
         elif isinstance(horizon, int):
@@ -94,7 +94,7 @@ def tracker_of(section: Mapping[str, Any], dynamics: Dynamics, horizon: int) -> 
         ConfigError: it is no controller, or not one of this robot.
     """
     extra = data_arguments(section, "tracker", dynamics, horizon)
-    kind = target_class(section, "tracker")
+    kind: Any = target_class(section, "tracker")
     given = {key: value for key, value in section.items() if key != NAME}
     taken = None if getattr(kind, "trains", True) else getattr(kind, "taken", None)
     if taken is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from sagemp_cli.loop.tracker import Tracker
+from sagemp_cli.loop.controller import Controller
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.proof import Proof
 from sagemp_cli.pipeline.reference_starts import reference_starts
@@ -15,7 +15,7 @@ from sagemp_cli.storage import Samples
 
 
 def sample_share(
-    context: StageContext, planner: Planner, tracker: Tracker, proof: Proof, *, wanted: int
+    context: StageContext, planner: Planner, tracker: Controller, proof: Proof, *, wanted: int
 ) -> Samples | None:
     """How many of so many further plans are certified by ``affine``; None if none are wanted.
 

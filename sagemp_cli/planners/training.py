@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sagemp_cli.config.ranges import Decay, Positive
 from sagemp_cli.errors import NonFiniteError, UsageError
@@ -76,6 +76,7 @@ def train_planner(
             raise UsageError(f"{name} must have shape (count, {wanted[0]}, {wanted[1]}), found {tuple(data.shape)}")
         if not bool(torch.isfinite(data).all()):
             raise NonFiniteError(f"{name} contain NaN or infinity")
+    assert isinstance(planner, nn.Module)
     planner.prepare(demonstrations, goal=problem.scene.goal, generator=generator)
 
     def loss_on(data: Tensor) -> Loss:
@@ -86,7 +87,7 @@ def train_planner(
     # Every validation draws the same numbers, so that its curve shows the planner's course and not chance.
     seed = int(torch.randint(2**31, (), generator=generator))
 
-    def validate(subject: LearnedPlanner) -> Mapping[str, float]:
+    def validate(subject: Any) -> Mapping[str, float]:
         drawn = torch.Generator().manual_seed(seed)
         figures = plan_figures(subject, shown, scene=problem.scene, position=position, generator=drawn)
         losses = [float(held_out_loss(subject, options.steps - 1, drawn)[0]) for _ in range(LOSS_BATCHES)]

@@ -49,7 +49,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     """Tube to scale on the left; states with their bounds, and the certified clearance, over time on the right."""
     record, setting = artifact.record, Setting.of(artifact.header.config)
     tubes, dynamics = record.tubes, setting.dynamics
-    count, horizon = len(tubes.references), tubes.references.shape[1] - 1
+    count, horizon = len(tubes.verdict), tubes.tube_lower.shape[1] - 1
     shown, flat = list(range(dynamics.state_dim)), len(dynamics.position) == 2
     columns = 1 if dynamics.state_dim <= 8 else 2
     rows = -(-(len(shown) + 1) // columns)
@@ -128,6 +128,7 @@ def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alp
         linewidths=float(np.clip(6 / np.sqrt(len(lower)), 0.3, 0.9)),
         zorder=5,
     )
+    assert tubes.references is not None
     path = tubes.references[reference][:, plane]
     axes.plot(*path.T, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=7)
 
@@ -147,6 +148,7 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
         axes.plot(times[:steps], upper.max(0), color=colour, linewidth=0.9)
     if steps < len(times):
         axes.axvline(times[steps], color=UNKNOWN, linewidth=1.1, linestyle=(0, (2, 2)))
+    assert tubes.references is not None
     axes.plot(times, tubes.references[reference, :, state], color=REFERENCE, linewidth=1.0, linestyle=(0, (4, 2)))
 
 

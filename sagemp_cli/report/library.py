@@ -32,7 +32,8 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
     """Tubes and references on the left, the account of all samples on the right."""
     record, setting = artifact.record, Setting.of(artifact.header.config)
     tubes, plane = record.tubes, setting.plane
-    count, horizon = len(tubes.references), tubes.references.shape[1] - 1
+    assert tubes.references is not None
+    count, horizon = len(tubes.verdict), tubes.tube_lower.shape[1] - 1
     figure = blank_figure(13, 5.4)
     grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1))
 

@@ -94,7 +94,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
         figure,
         f"{text} {total} rollouts stayed in their tube",
         f"{subject(artifact.header)}: {len(record.chosen)} starts measured in X$_I$, closest of "
-        f"{len(tubes.references)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
+        f"{len(tubes.verdict)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
         "random and worst-case disturbances; "
         f"{safe} of {total} kept clear and reached the goal, at the samples",
         colour=SAFE if inside == total else DANGER,

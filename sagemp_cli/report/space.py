@@ -62,6 +62,7 @@ def space_tube(axes: Axes3D, setting: Setting, tubes: Tubes, reference: int) -> 
     mine, index = tubes.cell_reference == reference, list(setting.dynamics.position)
     steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, index].min(0), tubes.tube_upper[mine][:, :steps, index].max(0)
+    assert tubes.references is not None
     path = tubes.references[reference][:, index]
     shade = TIME(np.arange(steps) / max(1, tubes.tube_lower.shape[1] - 1))
     behind = _behind(axes, setting, 0.5 * (lower + upper))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from sagemp_cli.config.binding import Binding, target_class
 from sagemp_cli.config.ranges import Fraction
@@ -67,6 +68,7 @@ def run(context: StageContext) -> Path:
     """Build the planner, let it learn from what it learns from, and write it with its model card."""
     problem = problem_of(context.config)
     planner = planner_of(context.config["planner"], problem.dynamics, problem.horizon)
+    assert isinstance(planner, nn.Module)
     learn = {"demonstrations": _from_demonstrations, "scenes": _from_scenes, "nothing": _as_it_is}
     outcome = learn[planner.learns_from](context, problem, planner)
     figures = {"parameters": float(sum(p.numel() for p in planner.parameters()))} | outcome.figures
@@ -90,7 +92,7 @@ def draw(context: StageContext) -> Path:
 
 def sections(config: Mapping[str, Any]) -> tuple[Binding, ...]:
     """What ``planner_training`` is bound to, by what the planner learns from; nothing where it learns nothing."""
-    planner = target_class(config["planner"], "planner")
+    planner: Any = target_class(config["planner"], "planner")
     learns_from = getattr(planner, "learns_from", "nothing")
     if learns_from == "demonstrations":
         return (

@@ -91,6 +91,7 @@ class ComparedLoop:
     def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The next state, the control and the deviation; a proof keeps of the last no more than its bounds."""
         robot = self.loop.dynamics
+        assert isinstance(robot, Learned)
         u = self.loop.control_given(numbers, x)
         derivative, deviation = robot.compared(x, u)
         return robot.advance(x, derivative, w + identity(deviation)), u, deviation

@@ -124,8 +124,7 @@ def falsify(
     start, disturbance = problem.start, problem.disturbance
     if start.lower.dim() > 2:
         raise UsageError(f"falsifier: start must have shape (n,) or (R, n), found {tuple(start.lower.shape)}")
-    batched = isinstance(loop, ClosedLoop) and loop.references.dim() > 2
-    if batched:
+    if isinstance(loop, ClosedLoop) and loop.references.dim() > 2:
         singles = [dataclasses.replace(loop, references=r) for r in loop.references]
         loop = dataclasses.replace(loop, references=loop.references[:, None])
     else:

@@ -101,4 +101,5 @@ def _start(prover: CellProver) -> None:
 
 
 def _prove(index: int, arrays: Mapping[str, np.ndarray]) -> tuple[int, dict[str, np.ndarray]]:
+    assert _prover is not None, "the worker was not started"
     return index, _prover.prove(Chunk.of(index, arrays)).arrays()
