@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 from hostile_service import KEY, QUICK, SLOW, hostile, shows_key
 
-from sagemp_cli.config.composition import load_scene
+from sagemp_cli.config.folders import load_scene
 from sagemp_cli.errors import SagempError
 from sagemp_cli.planners.vlm import VLM, request, service
 from sagemp_cli.scenes import scene_from_mapping

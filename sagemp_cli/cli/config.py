@@ -52,7 +52,8 @@ def validate(overrides: Overrides = None) -> None:
 @app.command("list", cls=Command, epilog=examples("sagemp config list", "sagemp config list experiment=unicycle_node"))
 def list_options(overrides: Overrides = None) -> None:
     """List the config groups and their options; the ones in use are marked with a star."""
-    from sagemp_cli.config.composition import chosen_options, config_file, groups, options_of
+    from sagemp_cli.config.composition import chosen_options, groups, options_of
+    from sagemp_cli.config.folders import config_file
 
     chosen, width = chosen_options(overrides or []), terminal_width()
     for group in groups():

@@ -38,7 +38,8 @@ def examine() -> dict[str, Any]:
     import torch
 
     from sagemp_cli import __version__
-    from sagemp_cli.config.composition import options_of, resource_folder
+    from sagemp_cli.config.composition import options_of
+    from sagemp_cli.config.folders import resource_folder
 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -34,7 +34,7 @@ def make_project(name: str) -> Path:
     Raises:
         UsageError: the name cannot be a module's, belongs to a robot already, or the folder is there.
     """
-    from sagemp_cli.config.composition import resource_folder
+    from sagemp_cli.config.folders import resource_folder
     from sagemp_cli.plugins import KINDS
     from sagemp_cli.storage.atomic import write_whole
 

@@ -12,43 +12,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard, cast
 
-import yaml
-
-from sagemp_cli.errors import ArtifactError, ConfigError, did_you_mean
+from sagemp_cli.config.folders import (
+    config_file,
+    config_folders,
+    first_line,
+    is_file,
+    load_scene,
+    mapping_in,
+    resource_folder,
+)
+from sagemp_cli.config.inherited import set_back_options_of_others
+from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.plugins import KINDS
 from sagemp_cli.plugins.project import current_project
 from sagemp_cli.plugins.registry import from_outside
-from sagemp_cli.reading.plain_yaml import plain_yaml
-from sagemp_cli.reading.regular import is_there, require_regular
 
-_PACKAGE = Path(__file__).resolve().parents[1]
 _ROOT = "sagemp"
 """The file that everything begins with; a project's own ``conf/`` has other files, and usually no such one."""
-_DEFAULT_EXPERIMENT = "unicycle_node"
-_OPTIONS = {group: (group,) for group in KINDS} | {
-    "tracker_training": ("tracker_training",),
-    "planner": ("planner", "planner_training"),
-    "dynamics": ("dynamics", "dynamics_training"),
-}
-"""Groups whose options belong to what is picked, with the sections that they are in."""
-
-
-def resource_folder(name: str) -> Path:
-    """The folder ``conf`` or ``data``: inside the installed package, or at the top of a checkout."""
-    inside = _PACKAGE / name
-    return inside if inside.is_dir() else _PACKAGE.parent / name
-
-
-def config_folders() -> list[Path]:
-    """Where config files are looked for, in order: the project's own ``conf/``, and the package's."""
-    own, brought = current_project().conf, resource_folder("conf")
-    return [brought] if own is None or own.resolve() == brought.resolve() else [own, brought]
-
-
-def config_file(group: str, option: str) -> Path | None:
-    """The file of an option of a config group; None for one that a plugin brings without a file."""
-    found = (folder / group / f"{option}.yaml" for folder in config_folders())
-    return next((path for path in found if path.is_file()), None)
 
 
 def groups() -> list[str]:
@@ -101,7 +81,7 @@ def _checked(overrides: Sequence[str]) -> dict[str, Any]:
         if _is_numbers(listed) and _is_number(given):
             _put(config, override.key_or_group, [given] * len(listed))
     picked = {o.key_or_group: str(o.value()) for o in parsed if _is_group(o.key_or_group)}
-    _set_back_options_of_others(config, picked, [o.key_or_group for o in values])
+    set_back_options_of_others(config, picked, [o.key_or_group for o in values], alone=_alone)
     config["scene"] = load_scene(config["scene"])
     return config
 
@@ -131,7 +111,7 @@ def _chosen(override: Any) -> str:
     from hydra.core.config_store import ConfigStore
 
     group, option = override.key_or_group, override.value()
-    if group == "experiment" and _is_file(option):
+    if group == "experiment" and is_file(option):
         option = re.sub(r"\W", "_", f"_{option}")
         ConfigStore.instance().store(group=group, name=option, node=_experiment(override.value()), package="_global_")
         return f"{group}={option}"
@@ -168,52 +148,6 @@ def _experiment(path: str) -> dict[str, Any]:
     return {"name": Path(path).stem} | data
 
 
-def _set_back_options_of_others(config: dict[str, Any], picked: Mapping[str, str], said: Sequence[str]) -> None:
-    """Where another planner is in use than an experiment picks, take back what the experiment says for its own one.
-
-    An experiment may extend another one, whose options are for what that one picks. Of the groups this holds for, see
-    :data:`_OPTIONS`.
-
-    Args:
-        config: changed in place.
-        picked: options of groups that the command line picks.
-        said: dotted keys that the command line sets itself.
-    """
-    chain = _experiments(picked.get("experiment") or current_project().experiment or _DEFAULT_EXPERIMENT)
-    for group, sections in _OPTIONS.items():
-        now = picked.get(group) or chain[-1][1].get(group)
-        others = [body for body, choices in chain if choices.get(group, now) != now]
-        if now is None or not others:
-            continue
-        own = [body for body, choices in chain if choices.get(group, now) == now]
-        alone = _alone(group, now)
-        for name in sections:
-            usual = alone.get(name) or {}
-            for key, value in [item for body in others for item in (body.get(name) or {}).items()]:
-                kept = any(key in (body.get(name) or {}) for body in own)
-                if kept or any(f"{s}.".startswith(f"{name}.{key}.") for s in said) or config[name].get(key) != value:
-                    continue
-                if key in usual:
-                    config[name][key] = usual[key]
-                else:
-                    del config[name][key]
-
-
-def _experiments(name: str) -> list[tuple[Mapping[str, Any], dict[str, str]]]:
-    """An experiment's file and those that it extends, which come first, each with the options that it picks."""
-    path = Path(name) if _is_file(name) else config_file("experiment", name)
-    if path is None or not path.is_file():
-        return [({}, {})]
-    body, chain, choices = mapping_in(path, f"experiment file {path}"), [], {}
-    for default in body.get("defaults") or []:
-        if isinstance(default, str) and default != "_self_":
-            chain += _experiments(default)
-            choices |= chain[-1][1]
-        elif isinstance(default, Mapping):
-            choices |= {str(g).removeprefix("override ").lstrip("/"): str(option) for g, option in default.items()}
-    return [*chain, (body, choices)]
-
-
 def _alone(group: str, option: str) -> Mapping[str, Any]:
     """What an option's file says by itself."""
     from omegaconf import OmegaConf
@@ -231,7 +165,7 @@ def _composed(overrides: Sequence[str]) -> dict[str, Any]:
     try:
         config = OmegaConf.to_container(_hydra(overrides), resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as e:
-        raise ConfigError(f"config: {_first_line(e)}") from None
+        raise ConfigError(f"config: {first_line(e)}") from None
     assert isinstance(config, dict)
     return cast("dict[str, Any]", config)
 
@@ -255,7 +189,7 @@ def _hydra(overrides: Sequence[str], *, with_hydra: bool = False, name: str = _R
         with initialize_config_dir(config_dir=str(resource_folder("conf")), version_base="1.3"):
             return hydra_compose(config_name=name, overrides=said, return_hydra_config=with_hydra)
     except (HydraException, OmegaConfBaseException) as e:
-        raise ConfigError(f"config: {_first_line(e)}") from None
+        raise ConfigError(f"config: {first_line(e)}") from None
 
 
 def _parse(text: str) -> Any:
@@ -266,7 +200,7 @@ def _parse(text: str) -> Any:
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as e:
-        raise ConfigError(f"'{text}' is not an override of the form key=value: {_first_line(e)}") from None
+        raise ConfigError(f"'{text}' is not an override of the form key=value: {first_line(e)}") from None
     if override.is_sweep_override():
         raise ConfigError(f"{text}: sweeps are not supported; give one value (lists are written [1,2])")
     if override.is_delete():
@@ -274,7 +208,7 @@ def _parse(text: str) -> Any:
     group = override.key_or_group
     if _is_group(group):
         choice, known = override.value(), options_of(group)
-        if group == "experiment" and _is_file(choice):
+        if group == "experiment" and is_file(choice):
             if not Path(choice).is_file():
                 raise ConfigError(f"experiment={choice}: no such file; known experiments: {', '.join(known)}")
         elif choice not in known:
@@ -298,10 +232,6 @@ def _check_override(override: Any, before: Mapping[str, Any]) -> None:
 
 def _is_group(key: str) -> bool:
     return any((folder / key).is_dir() for folder in config_folders())
-
-
-def _is_file(choice: Any) -> TypeGuard[str]:
-    return isinstance(choice, str) and choice.endswith((".yaml", ".yml"))
 
 
 def _surroundings() -> tuple[Any, ...]:
@@ -338,55 +268,3 @@ def _put(config: dict[str, Any], dotted: str, value: Any) -> None:
     for part in path:
         config = config[part]
     config[last] = value
-
-
-_LARGEST_YAML = 1_000_000
-
-
-def load_scene(scene: Any) -> Any:
-    """Replace a scene's name or path by the content of its YAML file; mappings pass through."""
-    if not isinstance(scene, str):
-        return scene
-    folder = resource_folder("data") / "scenes"
-    if "/" in scene or scene.endswith((".yaml", ".yml")):
-        if not is_there(Path(scene)):
-            raise ConfigError(f"scene '{scene}': no such file (looked for {Path(scene).resolve()})")
-        return mapping_in(Path(scene), f"scene file {scene}")
-    known = sorted(p.stem for p in folder.glob("*.yaml"))
-    if scene not in known:
-        raise ConfigError(
-            f"scene '{scene}': no such scene{did_you_mean(scene, known)}; known: {', '.join(known)}; "
-            f"one of your own is given as a file, scene=path/to/file.yaml"
-        )
-    return mapping_in(folder / f"{scene}.yaml", f"scene file {scene}")
-
-
-def mapping_in(path: Path, what: str) -> dict[str, Any]:
-    """The mapping in a YAML file.
-
-    Args:
-        path: the file.
-        what: what it is, for messages.
-
-    Raises:
-        ConfigError: it is missing, too large, or not plain YAML with a mapping in it.
-    """
-    try:
-        if require_regular(path, "a file in YAML") > _LARGEST_YAML:
-            raise ConfigError(f"{what}: is larger than {_LARGEST_YAML} bytes")
-        data = plain_yaml(path.read_text(encoding="utf-8"))
-    except ArtifactError as e:
-        raise ConfigError(f"{what}: {str(e).removeprefix(f'{path}: ')}") from None
-    except OSError as e:
-        raise ConfigError(f"{what}: cannot be read ({e.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise ConfigError(f"{what}: not readable as YAML ({_first_line(e)})") from None
-    except ValueError as e:
-        raise ConfigError(f"{what}: {e}") from None
-    if not isinstance(data, dict):
-        raise ConfigError(f"{what}: must hold a mapping, found {type(data).__name__}")
-    return data
-
-
-def _first_line(error: BaseException) -> str:
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

@@ -6,7 +6,7 @@ import pytest
 
 from sagemp_cli.checker.balls import Unproved
 from sagemp_cli.checker.scene import SafeSet
-from sagemp_cli.config.composition import load_scene
+from sagemp_cli.config.folders import load_scene
 
 
 def test_landmarks_and_drawings_change_nothing_about_the_safe_set():

@@ -7,7 +7,8 @@ import re
 import pytest
 import yaml
 
-from sagemp_cli.config.composition import chosen_options, compose, groups, load_scene, options_of, resource_folder
+from sagemp_cli.config.composition import chosen_options, compose, groups, options_of
+from sagemp_cli.config.folders import load_scene, resource_folder
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.pipeline.requirements import require_sound_config
 

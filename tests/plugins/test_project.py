@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from sagemp_cli.config.composition import compose, config_file, options_of
+from sagemp_cli.config.composition import compose, options_of
+from sagemp_cli.config.folders import config_file
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.pipeline.requirements import require_sound_config
 from sagemp_cli.plugins.project import current_project

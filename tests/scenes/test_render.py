@@ -10,7 +10,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from sagemp_cli.config.composition import load_scene
+from sagemp_cli.config.folders import load_scene
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.scenes import OBJECTS, Ball, Block, Frame, Landmark, Scene, png_bytes, render, scene_from_mapping
 from sagemp_cli.scenes.objects import PLAIN, PLATE

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sagemp_cli.config.composition import load_scene, resource_folder
+from sagemp_cli.config.folders import load_scene, resource_folder
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.scenes import Ball, Block, scene_from_mapping
 from sagemp_cli.sets import Box

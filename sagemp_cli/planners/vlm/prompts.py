@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from sagemp_cli.config.composition import resource_folder
+from sagemp_cli.config.folders import resource_folder
 from sagemp_cli.errors import ConfigError, did_you_mean
 
 AXES = {"blue_circles": ((-1.0, 1.0), (-1.0, 0.0))}

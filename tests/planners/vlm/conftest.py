@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from sagemp_cli.config.composition import load_scene
+from sagemp_cli.config.folders import load_scene
 from sagemp_cli.planners.vlm import VLM
 from sagemp_cli.planners.vlm import request as request_module
 from sagemp_cli.planners.vlm import service as service_module
