@@ -73,9 +73,8 @@ def ask(kind: str, seed: int, *, timeout: float, time_limit: float) -> Trial:
             "backoff": 0.01,
             "cache": folder,
         }
-        planner = VLM(
-            state_dim=3, horizon=20, dt=0.5, provider=("openai", "gemini")[seed % 3 == 0], attempts=1, service=options
-        )
+        provider, about = ("openai", "gemini")[seed % 3 == 0], service.ServiceOptions(**options)
+        planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider, attempts=1, service=about)
         code, message, complaints = 0, "", []
         began = time.monotonic()
         try:

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.planners.vlm.words import WORDS
+
+
+@dataclass(frozen=True)
+class ReaderOptions:
+    """Size of a :class:`SceneReader`, see there."""
+
+    pixels: int = 48
+    channels: int = 16
+
+    def __post_init__(self) -> None:
+        pixels, channels = self.pixels, self.channels
+        if pixels < 16 or pixels % 8 or channels < 4 or channels % 4:
+            raise ConfigError(
+                "planner.network: pixels must be a multiple of 8 from 16 up and channels a multiple of 4, "
+                f"found {pixels} and {channels}"
+            )
 
 
 class SceneReader(nn.Module):
@@ -26,11 +44,7 @@ class SceneReader(nn.Module):
 
     def __init__(self, *, pixels: int = 48, channels: int = 16) -> None:
         super().__init__()
-        if pixels < 16 or pixels % 8 or channels < 4 or channels % 4:
-            raise ConfigError(
-                "planner.network: pixels must be a multiple of 8 from 16 up and channels a multiple of 4, "
-                f"found {pixels} and {channels}"
-            )
+        ReaderOptions(pixels, channels)  # complains about a wrong one
         self.pixels = pixels
         fine, middle, deep = channels, 2 * channels, 3 * channels
         self.told = nn.Sequential(nn.Linear(len(WORDS), 48), nn.SiLU(), nn.Linear(48, 48), nn.SiLU())

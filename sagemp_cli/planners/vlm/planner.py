@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sagemp_cli.config.binding import options_for
-from sagemp_cli.config.ranges import Count, Decay, Positive
+from sagemp_cli.config.ranges import Count, Decay, NonNegative, Positive
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.learning.checkpoint import Resumable
 from sagemp_cli.learning.fit import History, fit
@@ -23,7 +22,7 @@ from sagemp_cli.planners.base import starts_of
 from sagemp_cli.planners.vlm.answer import MOST_WAYPOINTS, AnswerError, waypoints_of
 from sagemp_cli.planners.vlm.lessons import Lessons, answer_figures
 from sagemp_cli.planners.vlm.local import Local
-from sagemp_cli.planners.vlm.network import SceneReader
+from sagemp_cli.planners.vlm.network import ReaderOptions, SceneReader
 from sagemp_cli.planners.vlm.practice import practice_of, random_exercise
 from sagemp_cli.planners.vlm.prompts import axes_of, fill, template
 from sagemp_cli.planners.vlm.question import Question
@@ -102,9 +101,9 @@ class VLM(nn.Module):
         prompt: a name in ``data/prompts``, or the path of a text file.
         attempts: how often a question is asked until an answer is usable.
         most_waypoints: an answer with more is not usable.
-        drive: options of :class:`~sagemp_cli.planners.vlm.waypoints.Drive`.
-        service: options of :class:`~sagemp_cli.planners.vlm.service.ServiceOptions`.
-        network: options of :class:`~sagemp_cli.planners.vlm.network.SceneReader`.
+        drive: how waypoints are driven.
+        service: how a service is called.
+        network: size of the stand-in's network.
         diversity: of the stand-in's answers: 0 always the cheapest way, about 1 other sides as well.
         recording: file of recorded answers, or a folder of them, such as a service's cache.
     """
@@ -121,12 +120,12 @@ class VLM(nn.Module):
         dt: float,
         provider: str = "local",
         prompt: str = "over_burger",
-        attempts: int = 3,
-        most_waypoints: int = MOST_WAYPOINTS,
-        drive: Mapping[str, Any] | None = None,
-        service: Mapping[str, Any] | None = None,
-        network: Mapping[str, Any] | None = None,
-        diversity: float = 0.3,
+        attempts: Count = 3,
+        most_waypoints: Count = MOST_WAYPOINTS,
+        drive: Drive | None = None,
+        service: ServiceOptions | None = None,
+        network: ReaderOptions | None = None,
+        diversity: NonNegative = 0.3,
         recording: str | None = None,
     ) -> None:
         super().__init__()
@@ -139,24 +138,19 @@ class VLM(nn.Module):
             raise ConfigError(f"planner.provider must be one of {', '.join(PROVIDERS)}, found '{provider}'")
         if (recording is None) == (provider == "replay"):
             raise ConfigError(f"planner.recording is for provider 'replay' and only for it, found {recording!r}")
-        if attempts < 1 or most_waypoints < 1 or not 0 <= diversity < float("inf"):
-            raise ConfigError(
-                "planner: attempts and most_waypoints must be positive and diversity not negative, "
-                f"found {attempts}, {most_waypoints} and {diversity}"
-            )
         template(prompt)  # complain about a missing one now
         self.state_dim, self.horizon, self.dt = int(state_dim), int(horizon), float(dt)
         self.provider_name, self.prompt, self.recording = provider, prompt, recording
         self.attempts, self.most_waypoints, self.diversity = int(attempts), int(most_waypoints), float(diversity)
-        self.drive = Drive(**options_for(Drive, drive, "planner.drive"))
-        self.service = ServiceOptions(**options_for(ServiceOptions, service, "planner.service"))
+        self.drive, self.service, self.network = (
+            drive or Drive(),
+            service or ServiceOptions(),
+            network or ReaderOptions(),
+        )
         self.learns_from = "scenes" if provider == "local" else "nothing"
         if provider in ENDPOINTS:
             self.affordable_plans = SERVICE_PLANS
-        self.network = dict(network or {})
-        self.reader = (
-            SceneReader(**options_for(SceneReader, network, "planner.network")) if provider == "local" else None
-        )
+        self.reader = SceneReader(**asdict(self.network)) if provider == "local" else None
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -171,7 +165,7 @@ class VLM(nn.Module):
             "most_waypoints": self.most_waypoints,
             "drive": asdict(self.drive),
             "service": asdict(self.service),
-            "network": self.network,
+            "network": asdict(self.network),
             "diversity": self.diversity,
             "recording": self.recording,
         }

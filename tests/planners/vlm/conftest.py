@@ -17,7 +17,7 @@ from sagemp_cli.config.folders import load_scene
 from sagemp_cli.planners.vlm import VLM
 from sagemp_cli.planners.vlm import request as request_module
 from sagemp_cli.planners.vlm import service as service_module
-from sagemp_cli.planners.vlm.service import ENDPOINTS
+from sagemp_cli.planners.vlm.service import ENDPOINTS, ServiceOptions
 from sagemp_cli.scenes import Frame, Scene, scene_from_mapping
 
 START = torch.tensor([-1.5, -0.2, 0.0], dtype=torch.float64)
@@ -147,9 +147,8 @@ def ask(server, provider, table, monkeypatch) -> Callable[..., torch.Tensor]:
             monkeypatch.setenv(variable, key)
         server.replies[:] = [r if isinstance(r, Reply) else Reply(body=completion(r)) for r in replies]
         options = {"base_url": server.url, "image_height": 32, "backoff": 0.01, "timeout": 20.0, "retries": 2} | service
-        planner = VLM(
-            state_dim=3, horizon=20, dt=0.5, provider=provider, prompt=prompt, attempts=attempts, service=options
-        )
+        given = {"provider": provider, "prompt": prompt, "attempts": attempts, "service": ServiceOptions(**options)}
+        planner = VLM(state_dim=3, horizon=20, dt=0.5, **given)
         generator = torch.Generator().manual_seed(seed)
         return planner.sample(START, table.goal, scene=table, count=count, generator=generator)
 

@@ -14,6 +14,7 @@ from sagemp_cli.config.binding import build
 from sagemp_cli.config.composition import compose
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM
+from sagemp_cli.planners.vlm.network import ReaderOptions
 from sagemp_cli.planners.vlm.planner import PracticeOptions
 from sagemp_cli.sets import Box
 
@@ -109,14 +110,16 @@ def test_a_pipe_a_huge_file_and_an_empty_folder_are_no_recordings(tmp_path, tabl
         ({"prompt": "burger"}, "planner.prompt 'burger': no such prompt"),
         ({"provider": "replay"}, "planner.recording is for provider 'replay' and only for it, found None"),
         ({"recording": "a.json"}, "planner.recording is for provider 'replay' and only for it, found 'a.json'"),
-        ({"attempts": 0}, "attempts and most_waypoints must be positive"),
+        ({"attempts": 0}, "planner.attempts must be a whole number of at least 1, found 0"),
         ({"drive": {"radius": 1.0}}, "planner.drive.radius: Drive has no such option"),
         ({"network": {"pixels": 20}}, "planner.network: pixels must be a multiple of 8"),
     ],
 )
 def test_wrong_options_are_named(options, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        VLM(**(SIZES | options))
+        about = SIZES | {key: value for key, value in options.items() if key in SIZES}
+        section = {key: value for key, value in options.items() if key not in SIZES}
+        build({"name": "vlm"} | section, "planner", **about)
 
 
 def test_a_goal_without_a_place_is_refused(table):
@@ -134,7 +137,7 @@ def test_a_service_has_nothing_to_learn(table):
 
 @pytest.fixture(scope="module")
 def taught(table):
-    planner = VLM(**SIZES, network={"pixels": 32, "channels": 8})
+    planner = VLM(**SIZES, network=ReaderOptions(pixels=32, channels=8))
     history = planner.learn(TOY, scene=table, generator=torch.Generator().manual_seed(0))
     return planner, history
 
@@ -154,7 +157,7 @@ def test_the_stand_in_says_that_it_is_one(taught):
 
 def test_learning_again_with_the_same_seed_gives_the_same_bits(taught, table):
     planner, history = taught
-    again = VLM(**SIZES, network={"pixels": 32, "channels": 8})
+    again = VLM(**SIZES, network=ReaderOptions(pixels=32, channels=8))
     other = again.learn(TOY, scene=table, generator=torch.Generator().manual_seed(0))
     np.testing.assert_array_equal(history.loss, other.loss)
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in planner.state_dict().items())
@@ -162,7 +165,7 @@ def test_learning_again_with_the_same_seed_gives_the_same_bits(taught, table):
 
 def test_arguments_and_weights_rebuild_the_planner(taught, table):
     planner, _ = taught
-    again = VLM(**json.loads(json.dumps(planner.arguments)))
+    again = build({"name": "vlm"} | json.loads(json.dumps(planner.arguments)), "planner")
     again.load_state_dict(planner.state_dict())
     assert torch.equal(draw(planner, table), draw(again.eval(), table))
 

@@ -9,6 +9,7 @@ import re
 import pytest
 import torch
 
+from sagemp_cli.config.binding import build
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM, AnswerError, ServiceError
 from sagemp_cli.planners.vlm.service import ENDPOINTS, _retry_after
@@ -342,4 +343,4 @@ def test_a_damaged_cache_entry_is_named(ask, tmp_path):
 )
 def test_wrong_options_of_a_service_are_named(service, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        VLM(state_dim=3, horizon=20, dt=0.5, provider="openai", service=service)
+        build({"name": "vlm", "provider": "openai", "service": service}, "planner", state_dim=3, horizon=20, dt=0.5)
