@@ -87,7 +87,7 @@ def prove(
     import torch
 
     from sagemp_cli.cli.time_limit import time_limit as limited
-    from sagemp_cli.config.composition import mapping_in
+    from sagemp_cli.config.folders import mapping_in
     from sagemp_cli.plugins.loading import load_object
     from sagemp_cli.stages.prove import prove as proved
 
