@@ -5,54 +5,49 @@ from __future__ import annotations
 import inspect
 import os
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 from sagemp_cli.errors import EXIT_ERROR, EXIT_INTERRUPTED, SagempError
 
-_WrongCall: Any = typer.BadParameter.__mro__[1]
-"""The framework's own error of a call that it does not understand; it has no public name."""
 
-
-class _Ending:
-    """Errors reach the user as one line and an exit code of :mod:`sagemp_cli.errors`.
+@contextmanager
+def errors_as_lines() -> Iterator[None]:
+    """Whatever is raised within becomes a line on stderr and an exit code of :mod:`sagemp_cli.errors`.
 
     ``SAGEMP_DEBUG=1`` shows the traceback as well.
     """
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except SagempError as e:
+        _complain(f"error: {e}")
+        raise typer.Exit(e.exit_code) from None
+    except KeyboardInterrupt:
+        _complain(
+            "interrupted: nothing half-written is left; run the same command again, finished pieces are not made twice"
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except BrokenPipeError:
+        raise  # the reader of a pipe went away, which the framework ends quietly
+    except Exception as e:
+        what = " ".join(str(e).split())
+        _complain(f"internal error: {type(e).__name__}: {what} (a bug of sagemp; SAGEMP_DEBUG=1 shows where)")
+        raise typer.Exit(EXIT_ERROR) from None
+
+
+class Command(TyperCommand):
+    """A command whose errors reach the user as lines, see :func:`errors_as_lines`."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command and turn whatever it raises into a line and an exit code."""
-        try:
-            return super().invoke(ctx)  # type: ignore[misc]
-        except (typer.Exit, _WrongCall):
-            raise  # of an unknown command or option: the framework says it better, with exit code 2
-        except SagempError as e:
-            _complain(f"error: {e}")
-            code = e.exit_code
-        except KeyboardInterrupt:
-            _complain(
-                "interrupted: nothing half-written is left;"
-                " run the same command again, finished pieces are not made twice"
-            )
-            code = EXIT_INTERRUPTED
-        except BrokenPipeError:
-            raise  # the reader of a pipe went away, which the framework ends quietly
-        except Exception as e:
-            what = " ".join(str(e).split())
-            _complain(f"internal error: {type(e).__name__}: {what} (a bug of sagemp; SAGEMP_DEBUG=1 shows where)")
-            code = EXIT_ERROR
-        raise typer.Exit(code)
-
-
-class Command(_Ending, TyperCommand):
-    """A command."""
-
-
-class Group(_Ending, TyperGroup):
-    """All commands, with options of their own before them."""
+        """Run the command."""
+        with errors_as_lines():
+            return super().invoke(ctx)
 
 
 def examples(*lines: str) -> str:

@@ -26,12 +26,11 @@ from sagemp_cli.cli import (
     train_tracker,
     verify,
 )
-from sagemp_cli.cli.command import Command, Group, examples, flowing
+from sagemp_cli.cli.command import Command, errors_as_lines, examples, flowing
 from sagemp_cli.cli.completion import PIPELINE
 
 app = typer.Typer(
     name="sagemp",
-    cls=Group,
     rich_markup_mode="rich",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -95,7 +94,8 @@ def sagemp(
     if plugin:
         from sagemp_cli.plugins.loading import load_all
 
-        load_all(plugin)
+        with errors_as_lines():
+            load_all(plugin)
 
 
 def main() -> None:

@@ -185,3 +185,13 @@ def test_a_bug_is_one_line_unless_debugging_was_asked_for(sagemp, monkeypatch):
     )
     monkeypatch.setenv("SAGEMP_DEBUG", "1")
     assert "Traceback" in sagemp("gen-data").stderr
+
+
+def test_a_plugin_that_cannot_be_loaded_is_one_line_whatever_the_command(sagemp):
+    Path("broken_plugin.py").write_text("x = 1 / 0\n")
+    for plugin, message in (
+        ("nowhere.py", "error: plugin nowhere.py: no such file\n"),
+        ("broken_plugin.py", "error: plugin broken_plugin.py: line 1: ZeroDivisionError: division by zero\n"),
+    ):
+        refused = sagemp("--plugin", plugin, "config", "list")
+        assert (refused.exit_code, refused.stderr) == (2, message)
