@@ -145,6 +145,7 @@ def as_data(proof: LoopProof) -> dict[str, Any]:
         else {"step": example.step, "depth": example.depth, "start": example.start.tolist()},
         "unproved_violation": None if proof.unproved is None else proof.unproved.depth,
         "asks": claim.asks,
+        "notes": list(v.notes),
         "seconds": float(v.seconds.sum()),
     }
 
@@ -168,6 +169,7 @@ def as_lines(data: dict[str, Any]) -> list[str]:
             f"  a rollout breaks the claim by {data['unproved_violation']:.3g} in float64, which rigorous arithmetic "
             "does not prove: it may be rounding"
         )
+    lines += [f"  {note}" for note in data["notes"]]
     lines += [f"certificate {data['certificate']}", f"figure      {data['figure']}"]
     if data["verdict"] == "VERIFIED" and not data["checkable"]:
         lines.append("  nobody else can check it: only 'affine' records its relaxations, of steps that are alike")

@@ -123,7 +123,7 @@ class Propagator(ABC):
             watch: whether the controls and a recording are wanted too, if this propagator can give them.
 
         Raises:
-            UsageError: boxes that do not fit the loop; or controls are wanted of a loop that does not say them.
+            UsageError: boxes that do not fit the loop; or the loop overrides the step that says its controls.
             UnsupportedOperationError: the loop does what this propagator cannot bound.
         """
 

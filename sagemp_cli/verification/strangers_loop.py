@@ -11,7 +11,7 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -23,7 +23,6 @@ from sagemp_cli.reachability.any_loop import cells_of
 from sagemp_cli.reachability.observed import Observed
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator
-from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.adaptive import adaptive_cells
@@ -165,6 +164,7 @@ def verify_loop(
         propagator=propagator.name,
         rigorous=propagator.rigorous,
         recording=found.recording,
+        notes=found.notes,
     )
     return _attacked(seen, claim, verification, restarts, generator)
 
@@ -180,26 +180,12 @@ class _Cells:
         return CellTubes.join([self._proved(own, Box(low, high)) for own, low, high in chunks])
 
     def _proved(self, owner: Tensor, cells: Box) -> CellTubes:
-        loop, began, recording = self.seen.loop, time.perf_counter(), None
+        loop, began = self.seen.loop, time.perf_counter()
         with torch.no_grad(), one_thread():
-            run = getattr(self.propagator, "run", None)
-            if run is None:
-                tube = self.propagator.propagate(loop, cells, self.seen.disturbance)
-            else:
-                done = run(loop, cells, self.seen.disturbance)
-                tube, recording = done.tube, _recording(done)
+            found = self.propagator.reach(loop, cells, self.seen.disturbance, watch=True)
         seconds = torch.full((len(owner),), (time.perf_counter() - began) / len(owner), dtype=torch.float64)
         nothing = torch.zeros(len(owner), loop.horizon, 0, dtype=torch.float64)
-        return CellTubes(owner, cells, tube, nothing, nothing, seconds, recording)
-
-
-def _recording(run: Any) -> Recording | None:
-    """What a checker needs, of loops whose steps do the same operations; the recordings of others do not line up."""
-    bands = getattr(run, "bands", None)
-    if bands is None:
-        return None
-    shapes = {tuple((name, tuple(band.slope.shape[-1:])) for name, band in step) for step in bands}
-    return run.recording() if len(shapes) == 1 else None
+        return CellTubes(owner, cells, found.tube, nothing, nothing, seconds, found.recording, found.notes)
 
 
 def _shortfall(tube: Tube, claim: LoopClaim) -> tuple[Tensor, Tensor]:

@@ -58,6 +58,11 @@ class AffineRun:
     watched_upper: Tensor | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def alike(self) -> bool:
+        """Whether all steps do the same operations, so that what is recorded of them lines up."""
+        return len({tuple((name, band.slope.shape[-1:]) for name, band in step) for step in self.bands}) == 1
+
     def recording(self) -> Recording:
         """What a certificate keeps of the run."""
         return Recording.of(self.bands, self.tube.lower.shape[:-2], self.kept)
@@ -82,13 +87,15 @@ class Affine(Propagator):
     @torch.no_grad()
     def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
         """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
-        run = self.run(loop, start, disturbance, watch=watch)
+        strangers = isinstance(loop, RecordedLoop) and any(p.outputs.control is None for p in loop.programs)
+        run = self.run(loop, start, disturbance, watch=watch and not strangers)
+        recording = run.recording() if watch and run.alike else None
         lower, upper = run.watched_lower, run.watched_upper
         if lower is None or upper is None:
-            return Reach(run.tube, notes=run.notes)
+            return Reach(run.tube, recording=recording, notes=run.notes)
         bad = torch.isnan(lower) | torch.isnan(upper)
         lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
-        return Reach(run.tube, lower, upper, run.recording(), run.notes)
+        return Reach(run.tube, lower, upper, recording, run.notes)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """Of M generators at the last step, as many as if none were negligible: ``6 M n + 12 v^2`` numbers and
