@@ -18,13 +18,16 @@ class Loop(Protocol):
     @property
     def horizon(self) -> int:
         """Number of steps K."""
+        ...
 
     @property
     def state_dim(self) -> int:
         """Number of states n."""
+        ...
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., d)``, written in torch operations."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,10 @@ square roots are correctly rounded; functions have the margins that their relaxa
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
-
-T = TypeVar("T")
 
 UNIT = 2.0**-53
 """Unit roundoff u of float64: a correctly rounded operation errs by at most ``u`` times its result."""
@@ -36,7 +34,7 @@ def gamma(roundings: float) -> float:
     return roundings * UNIT
 
 
-def slack(size: T, roundings: float) -> T:
+def slack(size: Any, roundings: float) -> Any:
     """What so many roundings of numbers of at most that size can be off by, together."""
     return size * gamma(roundings)
 

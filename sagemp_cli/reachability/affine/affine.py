@@ -172,8 +172,8 @@ class Affine(Propagator):
         tube = Tube(
             *(torch.cat([f[..., None, :], s], -2) for f, s in zip((start.lower, start.upper), sides, strict=True))
         )
-        watched_sides = [_in_batch(side, batch) for side in zip(*controls, strict=True)] or [None, None]
-        return AffineRun(tube, bands, masks, kept, *watched_sides, boxed.notes())
+        low, high = [_in_batch(side, batch) for side in zip(*controls, strict=True)] or (None, None)
+        return AffineRun(tube, bands, masks, kept, low, high, boxed.notes())
 
 
 def _in_batch(steps: Sequence[Any], batch: torch.Size) -> Tensor:

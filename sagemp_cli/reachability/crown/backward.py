@@ -141,6 +141,7 @@ class _Sweep:
 
     def scaled(self, r: Replacement) -> Array:
         """Positive and negative parts of a replacement's coefficients, in units of the errors themselves."""
+        assert r.inverse is not None
         return self._split(self._values[:, LEAD + r.first : LEAD + r.last, : self._count] * r.inverse)
 
     def add(self, lines: Array, parts: Array) -> None:

@@ -59,13 +59,15 @@ class Best(Propagator):
         affine = Affine(symbols=self.symbols)
         hints: list[Hints] | None = None
         tubes: list[Tube] = []
+        notes: tuple[str, ...] = ()
         for n in range(self.rounds):
             run = affine.run(loop, start, disturbance, keep_steps=True, hints=hints)
             back, found = taken_back(run, start, rows=self.rows, inputs=n + 1 < self.rounds)
             hints = found if hints is None else _sharper(hints, found)
             tubes += [run.tube, back]
+            notes = run.notes
         lower, upper = (torch.stack(sides) for sides in zip(*((t.lower, t.upper) for t in tubes), strict=True))
-        return Reach(Tube(lower.amax(0), upper.amin(0)), notes=run.notes)
+        return Reach(Tube(lower.amax(0), upper.amin(0)), notes=notes)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """That of CROWN, and the bounds of all operations' inputs."""

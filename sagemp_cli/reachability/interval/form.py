@@ -40,7 +40,8 @@ def evaluate(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
     if i.kind == "join":
         return IntervalForm(join([o.lower for o in operands]), join([o.upper for o in operands]))
     if i.kind == "linear":
-        return _linear(*operands, *i.constants)
+        (operand,), (weight, bias) = operands, i.constants
+        return _linear(operand, weight, bias)
     if i.kind in _RULES:
         return _RULES[i.kind](*operands)
     if i.kind == "atan2":

@@ -32,7 +32,8 @@ def operands(program: Program, state: IntervalForm, disturbance: IntervalForm, n
         fixed = [program.instructions[slot].kind == "constant" for slot in i.operands]
 
         def bounded(name: str, form: IntervalForm) -> None:
-            noted.append(Hint(name, i.size, *(side.expand(cells, i.size) for side in form.bounds)))
+            lower, upper = (side.expand(cells, i.size) for side in form.bounds)
+            noted.append(Hint(name, i.size, lower, upper))
 
         if i.kind in ("maximum", "minimum"):
             if any(fixed):

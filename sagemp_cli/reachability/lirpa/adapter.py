@@ -134,7 +134,7 @@ def load() -> types.ModuleType:
         # The exporter that auto_LiRPA reads the graph with was moved to a private place in torch 2.9.
         if not hasattr(torch.onnx.utils, "_optimize_graph"):
             private = importlib.import_module("torch.onnx._internal.torchscript_exporter.utils")
-            torch.onnx.utils._optimize_graph = private._optimize_graph
+            torch.onnx.utils._optimize_graph = private._optimize_graph  # pyright: ignore[reportPrivateImportUsage]
         # neuralsat's copy imports Gurobi at the top for a solver that bounds never touch.
         if source.origin == "neuralsat" and importlib.util.find_spec("gurobipy") is None:
             sys.modules["gurobipy"] = types.ModuleType("gurobipy")
@@ -223,7 +223,8 @@ class _Rewriting(TorchFunctionMode):
 
         args = tuple(plain(a) for a in args)
         kwargs = {key: plain(a) for key, a in (kwargs or {}).items()}
-        return _REWRITES.get(getattr(func, "__name__", ""), func)(*args, **kwargs)
+        rewritten: Callable[..., Any] = _REWRITES.get(getattr(func, "__name__", "")) or func
+        return rewritten(*args, **kwargs)
 
 
 class _Traced(nn.Module):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -259,7 +260,7 @@ def add_product(a: Any, b: Any, c: Any, *, value: float = 1) -> Traced:
     """``a + value b c``."""
     if isinstance(b, Traced) or isinstance(c, Traced):
         return add_scaled("addcmul", a, multiply(b, c), value)
-    return add_parts(a, exact_parts("addcmul", lambda *factors: math.prod(factors), value, b, c))
+    return add_parts(a, exact_parts("addcmul", lambda *factors: Fraction(math.prod(factors)), value, b, c))
 
 
 @answers("addcdiv")

@@ -96,7 +96,8 @@ def corners_and_centres(cells: Box, disturbance: Box, *, most: int) -> tuple[Ten
         chosen = torch.randperm(len(both.lower), generator=generator)[:kept]
         both = Box(both.lower[chosen], both.upper[chosen])
     corners = torch.where(upper, both.upper[:, None], both.lower[:, None]).flatten(0, 1)
-    return torch.cat([both.center, corners]).split([cells.dim, disturbance.dim], dim=-1)
+    x, w = torch.cat([both.center, corners]).split([cells.dim, disturbance.dim], dim=-1)
+    return x, w
 
 
 def _gaps(i: Instruction, values: Sequence[Tensor]) -> list[Tensor]:
@@ -137,12 +138,15 @@ def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, 
     towards = torch.zeros_like(z)
     for _ in range(_NEWTON):
         z = z.requires_grad_(True)
-        gap = gaps(z).gather(1, own)
+        gap = gaps(z)
+        assert gap is not None
+        gap = gap.gather(1, own)
         (slope,) = torch.autograd.grad(gap.sum(), z)
         towards = torch.nan_to_num(slope / slope.square().sum(-1, keepdim=True))
         z = _inside(z.detach() - gap.detach() * towards, both)
     points = torch.cat([_inside(z + around * towards, both) for around in _AROUND])
-    return points.split(sizes, dim=-1)
+    x, w = points.split(sizes, dim=-1)
+    return x, w
 
 
 def _inside(z: Tensor, box: Box) -> Tensor:
@@ -165,4 +169,5 @@ def climbed(step: Step, program: Program, start: Box, disturbance: Box) -> tuple
             return None
         z = _inside(z.detach() + 0.25 * both.width * torch.sign(torch.nan_to_num(slope)), both)
         visited.append(z)
-    return torch.cat(visited).split(sizes, dim=-1)
+    x, w = torch.cat(visited).split(sizes, dim=-1)
+    return x, w

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeGuard
 
 import torch
 from torch import Tensor
@@ -80,9 +80,10 @@ def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
     steps = loop.horizon
     x, w = start.center.reshape(-1, start.dim)[0], disturbance.center.reshape(-1, disturbance.dim)[0]
     if _says_its_steps(loop):
-        numbers = loop.numbers().to(torch.float64)
+        says = loop
+        numbers = says.numbers().to(torch.float64)
         example = numbers.flatten(0, -2)[0]
-        program = record(lambda x, w, numbers: loop.step_given(numbers, x, w), x, w, example)
+        program = record(lambda x, w, numbers: says.step_given(numbers, x, w), x, w, example)
         return RecordedLoop((program,), numbers, steps)
     programs = [record(lambda x, w, k=k: loop.step(k, x, w), x, w) for k in range(steps)]
     if all(programs[0].same_as(other) for other in programs[1:]):
@@ -90,7 +91,13 @@ def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
     return RecordedLoop(tuple(programs), torch.zeros(steps, 0, dtype=torch.float64), steps)
 
 
-def _says_its_steps(loop: Any) -> bool:
+class _SaysItsSteps(Protocol):
+    def numbers(self) -> Tensor: ...
+
+    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> Any: ...
+
+
+def _says_its_steps(loop: Any) -> TypeGuard[_SaysItsSteps]:
     """Whether a loop's ``step_given`` says what its ``step`` does: whether none of its classes came later with another
     ``step`` or ``control``.
     """

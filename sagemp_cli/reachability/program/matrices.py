@@ -172,13 +172,13 @@ def _einsum(equation: str, *operands: Tensor) -> Tensor:
 
 
 @answers("cross")
-def cross(a: Any, b: Any, dim: int | None = None) -> Traced:
+def cross(a: Any, b: Any, dim: int | None = None) -> Any:
     """Cross product of three-vectors, along the first dimension of three entries."""
     return cross_along(a, b, dim=next((i for i, n in enumerate(a.shape) if n == 3), -1) if dim is None else dim)
 
 
 @answers("linalg_cross")
-def cross_along(a: Any, b: Any, *, dim: int = -1) -> Traced:
+def cross_along(a: Any, b: Any, *, dim: int = -1) -> Any:
     """Cross product of three-vectors."""
     if a.shape[dim] != 3 or a.shape != b.shape:
         raise UnsupportedOperationError(

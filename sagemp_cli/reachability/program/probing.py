@@ -144,13 +144,14 @@ def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box
             raise why_rows if batched else why_single
         raise UsageError(f"step works neither on one state ({why_single}) nor on a batch ({why_rows})")
     first = rows if single is None else single
+    assert first is not None
     reproduced(Step(function, batched=single is None), xs, ws, first)
     _same_on_plain_tensors(function, xs, ws, first, batched=single is None)
     # A batch means something only if its rows are stepped one by one: x[0] of a batch is a row, not a state's entry.
     rowwise = rows is not None and together is not None and agree(together, rows)
     if single is None and not rowwise:
         raise UsageError("step mixes the rows of a batch: a row's next state depends on the other rows")
-    if rowwise and not agree(rows, first):
+    if rowwise and rows is not None and not agree(rows, first):
         raise UsageError(
             f"step means one thing for a state of shape ({start.dim},) and another for a batch ({count}, {start.dim}); "
             f"say which is meant with batched=False or batched=True"

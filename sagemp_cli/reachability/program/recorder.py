@@ -7,7 +7,8 @@ from, so that whatever only moves entries is done by torch itself, on ids.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +18,8 @@ from sagemp_cli.reachability.program.kinds import INPUTS
 from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
 
 
-class Slot(NamedTuple):
+@dataclass(frozen=True)
+class Slot:
     """The value of an earlier instruction."""
 
     index: int
@@ -137,18 +139,18 @@ class Recorder:
     # -- bookkeeping ---------------------------------------------------------------------------------------------------
 
     def _new(self, instruction: Instruction, example: Tensor | None = None) -> Tensor:
-        if example is None:
-            example = instruction.on(*(self._examples[o] for o in instruction.operands))
+        of_it = (self._examples[o] for o in instruction.operands)
+        found: Tensor = (instruction.on(*of_it) if example is None else example).detach()
         start, self._size = self._size, self._size + instruction.size
         self._instructions.append(instruction)
         self._starts.append(start)
-        self._examples.append(example.detach())
+        self._examples.append(found)
         if self._size >= len(self._table):  # there is always a last entry, which is no number
             more = max(self._size + 1 - len(self._table), 1024)
             self._table = torch.cat([self._table, self._table.new_full((more,), torch.nan)])
             self._owner = torch.cat([self._owner, self._owner.new_zeros(more)])
             self._fixed = torch.cat([self._fixed, self._fixed.new_zeros(more)])
-        self._table[start : self._size] = example.detach()
+        self._table[start : self._size] = found
         self._owner[start : self._size] = len(self._instructions) - 1
         self._fixed[start : self._size] = instruction.kind == "constant"
         return torch.arange(start, self._size)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -98,15 +98,16 @@ class Traced(Tensor):
 
     # -- what a tensor says of itself ---------------------------------------------------------------------------------
 
-    shape = property(lambda self: self.ids.shape)
-    ndim = property(lambda self: self.ids.dim())
-    dtype = property(lambda self: torch.float64)
-    device = property(lambda self: self.ids.device)
-    layout = property(lambda self: torch.strided)
-    requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
-    data = property(lambda self: self._like(self.ids))
-    T = property(lambda self: self._like(self.ids.T))
-    mT = property(lambda self: self._like(self.ids.mT))
+    if not TYPE_CHECKING:  # torch declares attributes, which it takes no property for
+        shape = property(lambda self: self.ids.shape)
+        ndim = property(lambda self: self.ids.dim())
+        dtype = property(lambda self: torch.float64)
+        device = property(lambda self: self.ids.device)
+        layout = property(lambda self: torch.strided)
+        requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
+        data = property(lambda self: self._like(self.ids))
+        T = property(lambda self: self._like(self.ids.T))
+        mT = property(lambda self: self._like(self.ids.mT))
 
     def dim(self) -> int:
         """Number of dimensions."""
@@ -124,7 +125,7 @@ class Traced(Tensor):
 
     def storage_offset(self) -> int:
         """Where the first entry lies."""
-        return self.ids.storage_offset()
+        return int(self.ids.storage_offset())
 
     def numel(self) -> int:
         """Number of entries."""
@@ -136,7 +137,7 @@ class Traced(Tensor):
         """True."""
         return True
 
-    is_contiguous = lambda self, *args, **kwargs: self.ids.is_contiguous(*args, **kwargs)  # noqa: E731
+    is_contiguous = lambda self, *args, **kwargs: cast(Traced, self).ids.is_contiguous(*args, **kwargs)  # noqa: E731
     is_complex = lambda self: False  # noqa: E731
 
     def __len__(self) -> int:
@@ -151,7 +152,7 @@ class Traced(Tensor):
     def __deepcopy__(self, memo: Any) -> Traced:
         return self._like(copy.deepcopy(self.ids, memo))
 
-    def __repr__(self) -> str:
+    def __repr__(self, *, tensor_contents: Any = None) -> str:
         return f"Traced(shape={tuple(self.shape)})"
 
     def _like(self, ids: Tensor) -> Traced:
@@ -180,7 +181,8 @@ class Traced(Tensor):
             "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
         )
 
-    __bool__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __contains__ = _compared
+    if not TYPE_CHECKING:  # torch declares what each of them gives
+        __bool__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __contains__ = _compared
 
     def _number(self, *_: Any, **__: Any) -> Any:
         return self._refuse(

@@ -58,4 +58,5 @@ def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: T
     if slope is None:
         slope = m.clamp((high - negative_slope * low) / (high - low), negative_slope, 1.0)
         slope = m.where(lower >= 0, 1.0, m.where(upper <= 0, negative_slope, slope))
+    assert slope is not None
     return slope, m.maximum((negative_slope - slope) * low, (1.0 - slope) * high)

@@ -125,6 +125,7 @@ def lines(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None 
         found = excess(curve, slope, ends, values)
         pair = Lines(slope, found.least, slope, found.most)
         best = pair if best is None else _lines.choose(best, pair, middle)
+    assert best is not None
     return _lines.settled(best._replace(upper_offset=best.upper_offset + outside))
 
 

@@ -106,7 +106,7 @@ def cosine_band(lower: Tensor, upper: Tensor) -> Band:
     return _band(_COSINE, lower, upper)
 
 
-def sine_and_cosine_bands(lower: np.ndarray, upper: np.ndarray) -> tuple[Band, Band]:
+def sine_and_cosine_bands(lower: Any, upper: Any) -> tuple[Band, Band]:
     """Bands of ``sin`` on the first and of ``cos`` on the second of two arrays of intervals, ``(2, B, e)``.
 
     Both at once take as long as one of them.

@@ -201,7 +201,7 @@ def _joined(parts: Sequence[Combination]) -> Combination:
     """One after the other."""
     columns = max(part.matrix.shape[-1] for part in parts)
     rows = [part.padded(columns) for part in parts]
-    return Combination(*(torch.cat([r[j] for r in rows]) for j in range(2)), max(r.error for r in rows))
+    return Combination(torch.cat([r[0] for r in rows]), torch.cat([r[1] for r in rows]), max(r.error for r in rows))
 
 
 def _sum(a: Combination, b: Combination, sign: float = 1.0) -> Combination:

@@ -30,9 +30,9 @@ class Hint(NamedTuple):
     def intersected(self, other: Hint) -> Hint:
         """What holds if both hold; the other one, if they are not of the same input."""
         same_turn = all(map(torch.equal, self.turn or (), other.turn or ())) and (not self.turn) == (not other.turn)
-        if self.lower is None or self[:2] != other[:2] or not same_turn:
+        if self.lower is None or self.upper is None or self[:2] != other[:2] or not same_turn:
             return other
-        if other.lower is None:
+        if other.lower is None or other.upper is None:
             return self
         return self._replace(lower=torch.maximum(self.lower, other.lower), upper=torch.minimum(self.upper, other.upper))
 

@@ -17,10 +17,9 @@ tensors, through which a tube is differentiated.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from torch import Tensor
 
 from sagemp_cli.reachability.affine.compiled.arrays import contiguous, like, with_fresh
 from sagemp_cli.reachability.affine.compiled.folding import Node
@@ -33,7 +32,7 @@ from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
 from sagemp_cli.sets.rounding import BAND, SAFETY, SHIFT, TINY, of_generators, of_product, over_symbols
 from sagemp_cli.sets.zonotope import Zonotope
 
-Array = np.ndarray | Tensor
+Array = Any  # of numpy or of torch, which have no type in common: functions_of does the same to both
 
 
 class Value(NamedTuple):
