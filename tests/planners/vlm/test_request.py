@@ -19,6 +19,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from sagemp_cli.planners.vlm import request
 from sagemp_cli.planners.vlm.request import ask, ask_in_process, redacted
 
 HOSTILE_SERVICE = Path(__file__).parents[3] / "benchmarks" / "hostile_service.py"
@@ -37,8 +38,8 @@ def request_to(base_url: str, **changes: object) -> dict:
 
 
 def children() -> list[psutil.Process]:
-    """Processes that were started here; the one that reads files for other tests may wait for more of them."""
-    return [p for p in psutil.Process().children(recursive=True) if "sagemp_cli.reading" not in " ".join(p.cmdline())]
+    """Processes that ask; those of other tests (who read files, track shared memory) may wait for more of them."""
+    return [p for p in psutil.Process().children(recursive=True) if request.__file__ in p.cmdline()]
 
 
 SPELLINGS = {
@@ -141,12 +142,21 @@ def test_replies_that_never_end_and_handshakes_that_never_begin_end_in_time():
 
 def test_ctrl_c_ends_a_request_and_its_process():
     with hostile_service.hostile(lambda: hostile_service.silent(random.Random(0))) as (at, _):
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+        seen = []
+
+        def interrupt() -> None:
+            while not children():
+                time.sleep(0.05)
+            seen.extend(children())
+            os.kill(os.getpid(), signal.SIGINT)
+
+        timer = threading.Timer(0.3, interrupt)
+        timer.daemon = True
         timer.start()
         with pytest.raises(KeyboardInterrupt):
             ask_in_process(request_to(f"http://{at}"), 60.0)
         timer.join()
-    assert children() == []
+    assert len(seen) == 1 and children() == []
 
 
 def test_the_key_is_no_argument_of_the_process(monkeypatch):
