@@ -59,7 +59,11 @@ def test_what_has_bounds_is_bounded(name, propagator):
     assert bool(((tube.lower <= states) & (states <= tube.upper)).all())
 
 
-@pytest.mark.parametrize("function", [torch.sqrt, torch.reciprocal, torch.log, lambda x: x**-2], ids=str)
+@pytest.mark.parametrize(
+    "function",
+    [torch.sqrt, torch.reciprocal, torch.log, lambda x: x**-2],
+    ids=["sqrt", "reciprocal", "log", "power"],
+)
 def test_beyond_a_pole_and_the_end_of_a_domain_stays_infinite(function):
     loop = Step(lambda x, w: function(x) + w)
     tube = Affine().propagate(loop, Box.around([0.0, 1.0], [1.0, 0.5]), NOTHING)
