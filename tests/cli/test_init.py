@@ -50,7 +50,7 @@ def test_a_plan_of_its_own_goes_all_the_way_to_a_verdict_also_in_worker_processe
     """With next to no training: whether it is certified is not asked here, only that the tube is made and stored."""
     short = ("horizon=12", "tracker_training.steps=3", "tracker_training.tube_steps=0", "tracker_training.references=2")
     short += ("tracker_training.rollout_steps=4", "tracker_training.tube=null", "verify.falsifier.restarts=0")
-    workers = ("executor.workers=2", "executor.least=1", "proof.memory=0.002")
+    workers = ("verify.samples=0", "executor.workers=2", "executor.least=1", "proof.memory=0.0025")
     pools, pool = [], processes.ProcessPoolExecutor
     monkeypatch.setattr(processes, "ProcessPoolExecutor", lambda *a, **k: pools.append(a) or pool(*a, **k))
     made = rover("run", "--until", "verify", "planner=detour", *short, *workers)

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import from_json
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.planners.vlm.question import Question
@@ -57,7 +58,7 @@ def read_recording(path: Path) -> Recording:
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_FILE:  # a pipe would be read for ever
             raise UsageError(f"{path}: a recording must be a file of at most {LARGEST_FILE} bytes")
-        found = _File.model_validate(json.loads(path.read_bytes()))
+        found = _File.model_validate(from_json(path.read_bytes()))  # which has a limit of its own on depth
     except OSError as e:
         raise UsageError(f"{path}: cannot be read ({e.strerror})") from None
     except ValidationError:
