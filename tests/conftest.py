@@ -19,6 +19,27 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+SLOW = """
+    checker/test_mutants checker/test_program_mutants cli/test_check cli/test_end_to_end
+    cli/test_every_experiment cli/test_init cli/test_pipeline_commands cli/test_safety_rates
+    experts/test_parallel planners/test_generative planners/test_planner_training report/test_figures
+    report/test_safety stages/test_own_trackers stages/test_pipeline stages/test_reference_file
+    stages/test_resume stages/test_safety_rates stages/test_train_dynamics stages/test_train_planner
+    trackers/test_tube_loss verification/executors/test_cluster verification/executors/test_processes
+"""
+"""Whole pipelines, trainings, worker processes and campaigns: what ``make test-fast`` leaves out."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of slow files."""
+    root = Path(__file__).parent
+    slow = {root / f"{name}.py" for name in SLOW.split()}
+    assert all(path.is_file() for path in slow), "SLOW names a file that is not there"
+    for item in items:
+        if item.path in slow:
+            item.add_marker("slow")
+
+
 @pytest.fixture(scope="session")
 def toy_root(tmp_path_factory) -> Path:
     """The folder that the toy experiment's artifacts were written below; treat it as read-only."""
