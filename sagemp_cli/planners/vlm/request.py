@@ -142,11 +142,20 @@ class _TooLong(Exception):
     """More bytes than are read."""
 
 
+def _parsed(text: str) -> Any:
+    """JSON, by a parser with a limit of its own on depth: whoever shares the process may have moved Python's. Text that
+    is no Unicode (half a surrogate pair) is refused too.
+    """
+    from pydantic_core import from_json  # comes with openai
+
+    return from_json(text)
+
+
 def _answer(text: str) -> Outcome:
     """The answer in a reply's text: every type is looked at before it is relied on."""
     try:
-        reply = json.loads(text)
-    except (ValueError, RecursionError):
+        reply = _parsed(text)
+    except ValueError:
         return {"wrong": f"the reply is not JSON, found '{text[:60]}'"}
     if not isinstance(reply, dict):
         return {"wrong": f"the reply is not a JSON object, found {type(reply).__name__}"}
@@ -173,8 +182,8 @@ def _answer(text: str) -> Outcome:
 
 def _message(text: str) -> str:
     """What a service says of an error: its ``error.message``, else all of it."""
-    with suppress(ValueError, RecursionError):
-        said = json.loads(text)
+    with suppress(ValueError):
+        said = _parsed(text)
         said = said[0] if isinstance(said, list) and said else said  # as Gemini has it
         said = said.get("error", said) if isinstance(said, dict) else said
         said = said.get("message", said) if isinstance(said, dict) else said
