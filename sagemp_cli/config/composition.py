@@ -46,6 +46,18 @@ def options_of(group: str) -> list[str]:
     return sorted({name for name in files if not name.startswith("_")} | set(_plugins(group)))
 
 
+DEEPEST = 100
+"""Levels of lists and mappings in one override."""
+
+
+def _depth(text: str) -> int:
+    depth = most = 0
+    for c in text:
+        depth += (c in "[{") - (c in "]}")
+        most = max(most, depth)
+    return most
+
+
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     """The resolved config as plain data, with the scene's file read in.
 
@@ -62,9 +74,11 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     Raises:
         ConfigError: one line that names the override or key, with the nearest known name.
     """
+    if any(_depth(text) > DEEPEST for text in overrides):  # whoever shares the process may have moved Python's limit
+        raise ConfigError("config: an override is nested too deep")
     try:
         return _checked(overrides)
-    except RecursionError:
+    except RecursionError:  # of a file
         raise ConfigError("config: an override is nested too deep") from None
 
 
