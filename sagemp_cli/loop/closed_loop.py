@@ -66,7 +66,11 @@ class ClosedLoop:
 
     def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
         """``x_{k+1}`` from ``x_k (..., n)`` and ``w_k (..., n)``."""
-        return self.dynamics.step(x, self.control(k, x), w)
+        return self.after(x, self.control(k, x), w)
+
+    def after(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """The next state ``(..., n)`` under a control ``(..., m)``."""
+        return self.dynamics.step(x, u, w)
 
     def numbers(self) -> Tensor:
         """What each step has of its own, its window row by row, ``(K, ..., N n)``."""
@@ -74,10 +78,10 @@ class ClosedLoop:
         index = (steps[:, None] + torch.arange(self.tracker.lookahead)).clamp(max=self.horizon)
         return self.references[..., index, :].movedim(-3, 0).flatten(-2)
 
-    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    def step_given(self, numbers: Tensor, x: Tensor, w: Tensor) -> tuple[Tensor, ...]:
         """The next state and the control ``u_k``, from the step's :meth:`numbers`."""
         u = self.control_given(numbers, x)
-        return self.dynamics.step(x, u, w), u
+        return self.after(x, u, w), u
 
     def control_given(self, numbers: Tensor, x: Tensor) -> Tensor:
         """``u_k``, from the step's :meth:`numbers`."""
@@ -93,5 +97,5 @@ class ClosedLoop:
         states, controls = [x], []
         for k in range(w.shape[-2]):
             controls.append(self.control(k, states[-1]))
-            states.append(self.dynamics.step(states[-1], controls[-1], w[..., k, :]))
+            states.append(self.after(states[-1], controls[-1], w[..., k, :]))
         return torch.stack(states, dim=-2), torch.stack(controls, dim=-2)

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
-from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.stored import to_record
 from sagemp_cli.storage import LoopRecord, ProgramRecord
-from sagemp_cli.verification.deviation import ComparedLoop
+from sagemp_cli.verification.cells import step_of
 
 
-@torch.no_grad()
 def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
     """The loop of a problem under a tracker; the same whatever the references."""
     dynamics = problem.dynamics
     return LoopRecord(
-        programs=tuple(map(to_record, recorded(_loop(problem, tracker), problem.start, problem.disturbance).programs)),
+        programs=tuple(map(to_record, step_of(problem, tracker))),
         step_program=np.zeros(problem.horizon, np.int64),
         lookahead=tracker.lookahead,
         state_names=dynamics.state_names,
@@ -34,11 +31,9 @@ def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
     )
 
 
-@torch.no_grad()
 def deviation_record(problem: Problem, tracker: Controller) -> ProgramRecord:
     """The step of a learned robot's analytical model by way of the network: w enlarged by what the two differ by."""
-    loop = ComparedLoop(_loop(problem, tracker))
-    return to_record(recorded(loop, problem.start, problem.disturbance).programs[0])
+    return to_record(step_of(problem, tracker, compared=True)[0])
 
 
 def strangers_loop_record(
@@ -80,11 +75,4 @@ def strangers_loop_record(
         control_units=("",) * m,
         position=np.array(list(position), np.int64),
         dt=dt,
-    )
-
-
-def _loop(problem: Problem, tracker: Controller) -> ClosedLoop:
-    """On any reference."""
-    return ClosedLoop(
-        problem.dynamics, tracker, torch.zeros(problem.horizon + 1, problem.dynamics.state_dim, dtype=torch.float64)
     )

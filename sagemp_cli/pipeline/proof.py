@@ -53,6 +53,7 @@ class Proof:
         counts: cells per uncertain dimension, None for an adaptive partition.
         budget: cells of one reference at most, in an adaptive partition.
         memory: GiB.
+        compared: whether it is about the analytical model of a learned robot.
     """
 
     problem: Problem
@@ -61,6 +62,7 @@ class Proof:
     counts: list[int] | None
     budget: int
     memory: float
+    compared: bool = False
 
     @classmethod
     def of(cls, config: Mapping[str, Any], problem: Problem) -> Proof:
@@ -92,7 +94,7 @@ class Proof:
         require_references(references, problem.dynamics)
         if steps != problem.horizon:
             raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
-        prover = CellProver(self.propagator, problem, tracker)
+        prover = CellProver(self.propagator, problem, tracker, self.compared)
         found = footprint(prover, references[0])
         return verify_references(
             prover,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sagemp_cli.config.binding import Binding
@@ -17,15 +18,15 @@ from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.progress import Progress
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import TrueModel
-from sagemp_cli.verification.deviation import Folded, split
+from sagemp_cli.verification.verification import Verification
 
 
 @dataclass(frozen=True)
 class TrueModelProof:
-    """A proof with the learned robot's deviation folded into w.
+    """A proof with the learned robot's deviation folded into w, by forward affine arithmetic.
 
     Attributes:
-        proof: of the same problem, with a propagator that folds and cells of its own.
+        proof: of the same problem, about the analytical model, with cells of its own.
     """
 
     proof: Proof
@@ -40,7 +41,7 @@ class TrueModelProof:
         partitions = SECTION.options(config).get("partitions")
         counts = proof.counts if partitions is None else counts_of(partitions, proof.problem, SECTION.where)
         affine = proof.propagator if isinstance(proof.propagator, Affine) else Affine()
-        return cls(dataclasses.replace(proof, propagator=Folded(affine), counts=counts))
+        return cls(dataclasses.replace(proof, propagator=affine, counts=counts, compared=True))
 
     def verify(self, references: Tensor, tracker: Controller, progress: Progress) -> TrueModel:
         """Tubes and verdicts of references ``(R, K+1, n)``, and how much was folded."""
@@ -51,6 +52,14 @@ class TrueModelProof:
             tubes=tubes_record(plain),
             deviation=deviation.numpy(),
         )
+
+
+def split(found: Verification, controls: int) -> tuple[Verification, Tensor]:
+    """A verification about the analytical model as others are, and bounds of ``|e|`` over its tubes, ``(R, K, n)``."""
+    lower, upper = found.control_lower, found.control_upper
+    deviation = torch.maximum(-lower[..., controls:], upper[..., controls:])
+    plain = dataclasses.replace(found, control_lower=lower[..., :controls], control_upper=upper[..., :controls])
+    return plain, deviation
 
 
 def _options(*, partitions: Any = None) -> None:

@@ -7,6 +7,7 @@ bits, on which cells are together in a chunk.)
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +20,12 @@ from torch import Tensor
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
+from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
+from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.deviation import ComparedLoop
 from sagemp_cli.workers import one_thread
 
 
@@ -180,19 +184,32 @@ class CellProver:
     Attributes:
         propagator: bounds the loop.
         problem: what is proved.
-        tracker: the policy.
+        tracker: the policy, which stays as it is once something is proved of it.
+        compared: whether the loop is that of the analytical model of a learned robot, by way of the robot:
+            :class:`~sagemp_cli.verification.deviation.ComparedLoop`.
     """
 
     propagator: Propagator
     problem: Problem
     tracker: Controller
+    compared: bool = False
+
+    def loop(self, references: Tensor) -> ClosedLoop:
+        """What is bounded, on references ``(..., K+1, n)``."""
+        return loop_of(self.problem, self.tracker, references, compared=self.compared)
+
+    @functools.cached_property
+    def _programs(self) -> tuple[Program, ...]:
+        # Recorded once: a chunk has other numbers and no other step. It goes along to other processes if it is there.
+        return step_of(self.problem, self.tracker, compared=self.compared)
 
     def prove(self, chunk: Chunk) -> CellTubes:
         """Bound states and controls of every cell, with one thread wherever it runs."""
-        loop = ClosedLoop(self.problem.dynamics, self.tracker, chunk.references)
+        loop = self.loop(chunk.references)
         began = time.perf_counter()
         with torch.no_grad(), one_thread():
-            found = self.propagator.reach(loop, chunk.cells, self.problem.disturbance, watch=True)
+            known = RecordedLoop(self._programs, loop.numbers().to(torch.float64), loop.horizon)
+            found = self.propagator.reach(known, chunk.cells, self.problem.disturbance, watch=True)
             u_lower, u_upper = found.control_lower, found.control_upper
             if u_lower is None or u_upper is None:
                 shape = (len(chunk), loop.horizon, loop.dynamics.control_dim)
@@ -207,6 +224,19 @@ class CellProver:
         return CellTubes(
             chunk.cell_reference, chunk.cells, found.tube, u_lower, u_upper, seconds, found.recording, found.notes
         )
+
+
+def loop_of(problem: Problem, tracker: Controller, references: Tensor, *, compared: bool = False) -> ClosedLoop:
+    """The loop of a problem under a tracker; see :class:`CellProver`."""
+    return (ComparedLoop if compared else ClosedLoop)(problem.dynamics, tracker, references)
+
+
+@torch.no_grad()
+def step_of(problem: Problem, tracker: Controller, *, compared: bool = False) -> tuple[Program, ...]:
+    """The step of :func:`loop_of` as programs, the same whatever the references."""
+    any_reference = torch.zeros(problem.horizon + 1, problem.dynamics.state_dim, dtype=torch.float64)
+    loop = loop_of(problem, tracker, any_reference, compared=compared)
+    return recorded(loop, problem.start, problem.disturbance).programs
 
 
 class Run(Protocol):

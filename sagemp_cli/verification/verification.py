@@ -17,7 +17,6 @@ from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
-from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
@@ -273,7 +272,7 @@ def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
     """
     x = torch.stack([cells.center, *_vertices(cells)])
     problem = prover.problem
-    loop = ClosedLoop(problem.dynamics, prover.tracker, references)
+    loop = prover.loop(references)
     w = problem.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
         states, _ = loop.rollout(x, w)

@@ -10,11 +10,11 @@ import torch
 from sagemp_cli.checker.check import check
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.loop_record import deviation_record
+from sagemp_cli.pipeline.true_model import split
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import TrueModel
 from sagemp_cli.verification.cells import CellProver
-from sagemp_cli.verification.deviation import Folded, split
 from sagemp_cli.verification.verification import verify_references
 
 from .conftest import STEP, constants_of, slots_of
@@ -35,8 +35,8 @@ def write(case):
     def write(path, robot, section):
         problem, references = dataclasses.replace(case.problem, dynamics=robot), torch.from_numpy(case.tubes.references)
         own, true = (
-            verify_references(CellProver(propagator, problem, case.tracker), references, counts=[2, 1])
-            for propagator in (Affine(), Folded(Affine()))
+            verify_references(CellProver(Affine(), problem, case.tracker, compared), references, counts=[2, 1])
+            for compared in (False, True)
         )
         true, deviation = split(true, 2)
         learned = dataclasses.replace(

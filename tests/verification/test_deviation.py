@@ -11,7 +11,7 @@ from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
-from sagemp_cli.verification.deviation import Folded
+from sagemp_cli.verification.deviation import ComparedLoop
 
 STEPS = 15
 START = Box.around([0.0, 0.0, 0.0, 1.0], [0.1, 0.1, 0.05, 0.05])
@@ -24,6 +24,10 @@ def loop_of(robot):
         tracker = Tracker(state_dim=4, control_dim=2, lookahead=3, hidden=[4, 4], control_scale=[0.5, 0.5])
     reference = torch.arange(STEPS + 1, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0.0, 0.0, 0.0]).double()
     return ClosedLoop(robot, tracker, reference + torch.tensor([0.0, 0.0, 0.0, 1.0]).double())
+
+
+def compared(loop):
+    return ComparedLoop(loop.dynamics, loop.tracker, loop.references)
 
 
 @pytest.fixture(params=["derivative", "state"])
@@ -53,7 +57,7 @@ def rollouts(robot, loop):
 
 def test_tube_controls_and_deviations_enclose_the_analytical_loop(robot):
     loop = loop_of(robot)
-    found = Folded(Affine()).reach(loop, START, W, watch=True)
+    found = Affine().reach(compared(loop), START, W, watch=True)
     tube, lower, upper = found.tube, found.control_lower, found.control_upper
     widest = torch.zeros(STEPS, 4)
     for states, controls, deviation in rollouts(robot, loop):
@@ -66,7 +70,7 @@ def test_tube_controls_and_deviations_enclose_the_analytical_loop(robot):
 
 
 def test_the_deviation_is_recorded_as_one_identity(robot):
-    record = Folded(Affine()).reach(loop_of(robot), START, W, watch=True).recording
+    record = Affine().reach(compared(loop_of(robot)), START, W, watch=True).recording
     assert record.operations.count("identity") == 1
 
 
@@ -79,7 +83,7 @@ def test_the_learned_robots_own_tube_does_not_enclose_the_analytical_loop(robot)
 
 def test_a_reduced_tube_is_sound_and_wider(robot):
     loop = loop_of(robot)
-    tube, wide = (Folded(Affine(symbols=s)).propagate(loop, START, W) for s in (None, 12))
+    tube, wide = (Affine(symbols=s).propagate(compared(loop), START, W) for s in (None, 12))
     for states, *_ in rollouts(robot, loop):
         assert (states >= wide.lower).all() and (states <= wide.upper).all()
     assert (wide.width[-1] >= tube.width[-1] * (1 - 1e-6)).all()
@@ -87,7 +91,7 @@ def test_a_reduced_tube_is_sound_and_wider(robot):
 
 def test_an_exact_model_has_no_deviation_worth_speaking_of(learned_unicycle):
     robot = learned_unicycle(scale=1e-5)
-    found = Folded(Affine()).reach(loop_of(robot), START, W, watch=True)
+    found = Affine().reach(compared(loop_of(robot)), START, W, watch=True)
     lower, upper = found.control_lower, found.control_upper
     assert float(torch.maximum(-lower, upper)[:, 4:].max()) < 1e-6  # heading and speed, which the network has right
 
@@ -96,4 +100,4 @@ def test_a_robot_of_formulas_has_nothing_to_fold(learned_unicycle):
     robot = learned_unicycle().analytical
     assert isinstance(robot, Unicycle)
     with pytest.raises(UsageError, match="only a learned robot deviates from a model, found Unicycle"):
-        Folded(Affine()).reach(loop_of(robot), START, W)
+        compared(loop_of(robot))

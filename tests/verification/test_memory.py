@@ -15,7 +15,6 @@ from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
 from sagemp_cli.scenes import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellProver, Chunk
-from sagemp_cli.verification.deviation import Folded
 from sagemp_cli.verification.memory import GIB, MOST_AT_ONCE, Footprint, cells_within, footprint
 
 MEASURE = """
@@ -84,7 +83,7 @@ def needs(propagator, steps=50):
 def test_a_proof_about_a_learned_robots_model_counts_what_it_adds(learned_unicycle):
     plain = prover(Affine())
     plain = dataclasses.replace(plain, problem=dataclasses.replace(plain.problem, dynamics=learned_unicycle()))
-    folded = dataclasses.replace(plain, propagator=Folded(Affine()))
+    folded = dataclasses.replace(plain, compared=True)
     reference = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(11, 4)
     network, model = (footprint(p, reference) for p in (plain, folded))
     assert model.kept > 1.1 * network.kept and model.working > 1.1 * network.working
