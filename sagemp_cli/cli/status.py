@@ -9,7 +9,7 @@ import typer
 from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import Json, Overrides, Partitions, Seed, overrides_of
 from sagemp_cli.cli.rows import rows_of, terminal_width
-from sagemp_cli.cli.stage_command import context_of, maker
+from sagemp_cli.cli.stage_command import maker
 
 EXAMPLES = examples(
     "sagemp status",
@@ -23,12 +23,18 @@ def status(
 ) -> None:
     """Show an experiment's graph of files: fresh, stale, missing or damaged, and why.
 
-    A file is stale if a config key that it depends on, or one of its inputs, has changed since it was made.
+    A file is stale if a config key that it depends on, or one of its inputs, has changed since it was made. Values of
+    options are compared, not checked: that is what 'sagemp config validate' and every stage do.
     """
+    from sagemp_cli.config.composition import compose
+    from sagemp_cli.pipeline.context import StageContext
     from sagemp_cli.pipeline.freshness import Freshness, survey
+    from sagemp_cli.pipeline.outline import require_sound_outline
 
     given = overrides_of(overrides, seed=seed, partitions=partitions)
-    context = context_of(given)
+    config = compose(given)
+    require_sound_outline(config)
+    context = StageContext.of(config, typed=tuple(given))
     states = survey(context)
     why = {
         name: maker(context, name) if state.freshness is Freshness.MISSING else state.why

@@ -26,7 +26,7 @@ from sagemp_cli.config.ranges import OrInfinite
 from sagemp_cli.config.wording import described
 from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
 from sagemp_cli.plugins import KINDS
-from sagemp_cli.plugins.registry import resolve
+from sagemp_cli.plugins.registry import declared, resolve
 
 _MOST_MEMORY = 2**30
 """Bytes that an object may take; those of this project take a few MB."""
@@ -86,6 +86,15 @@ def target_class(section: Any, where: str) -> Callable[..., Any]:
     Raises:
         ConfigError: no such name.
     """
+    return resolve(where.partition(".")[0], _name_in(section, where), where)
+
+
+def attribute_of_target(section: Any, where: str, attribute: str, default: Any) -> Any:
+    """A class attribute of the section's :func:`target_class`, see :func:`~sagemp_cli.plugins.registry.declared`."""
+    return declared(where.partition(".")[0], _name_in(section, where), where, attribute, default)
+
+
+def _name_in(section: Any, where: str) -> Any:
     if not isinstance(section, Mapping):
         raise ConfigError(f"{where} must be a section with a name, found {_short(section)}")
     if NAME not in section and "_target_" in section:
@@ -93,7 +102,7 @@ def target_class(section: Any, where: str) -> Callable[..., Any]:
             f"{where}._target_ {_short(section['_target_'])}: made by an earlier version, which named classes by their "
             f"modules; make the file again, or write {where}.name"
         )
-    return resolve(where.partition(".")[0], section.get(NAME), where)
+    return section.get(NAME)
 
 
 def section_complaints(section: Any, where: str, given: Collection[str] | None = None) -> list[str]:

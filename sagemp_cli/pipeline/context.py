@@ -11,9 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from sagemp_cli.config.composition import compose, options_of
 from sagemp_cli.errors import ArtifactError, ConfigError
@@ -21,6 +19,9 @@ from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.reading.regular import is_there, sha256_if_there
 from sagemp_cli.storage import Artifact, Header, Parent, open_header, read_artifact, sha256_of, write_artifact
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class StageContext:
 
     def generator(self, purpose: str) -> torch.Generator:
         """A generator that depends on the purpose (``stage`` or ``stage: what for``) and that stage's seed only."""
+        import torch  # here, for 'status', which draws nothing, is to come at once
+
         seed = stage_named(purpose.partition(":")[0]).seed_in(self.config)
         digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
         return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))

@@ -2,78 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
 from typing import Any
 
-from sagemp_cli.config.binding import build, option_complaints, section_complaints
-from sagemp_cli.config.composition import options_of
-from sagemp_cli.config.ranges import Count, Whole
-from sagemp_cli.errors import ConfigError, UsageError, did_you_mean
-from sagemp_cli.pipeline.context import named_run_file
+from sagemp_cli.config.binding import build, section_complaints
+from sagemp_cli.errors import ConfigError, UsageError
+from sagemp_cli.pipeline.outline import outline_complaints, source_complaints
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.pipeline.proof import SECTION, counts_of
 from sagemp_cli.pipeline.stage import STAGES
 from sagemp_cli.plugins import KINDS
-
-Section = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class EffortOptions:
-    """The section ``effort``: a word, and what it adds to the names of folders."""
-
-    name: str
-    suffix: str
-
-
-@dataclass(frozen=True)
-class StartOptions:
-    """The section ``start``; the problem checks the numbers, which belong to the robot's states."""
-
-    center: Any
-    radius: Any
-
-
-@dataclass(frozen=True)
-class DisturbanceOptions:
-    """The section ``disturbance``."""
-
-    radius: Any
-
-
-@dataclass(frozen=True)
-class ConfigOptions:
-    """The keys at the top, and which of them are sections; what is in these is said where it is read."""
-
-    name: str
-    artifacts: str
-    sources: Section
-    seed: Whole
-    horizon: Count
-    scene: Section
-    start: StartOptions
-    disturbance: DisturbanceOptions
-    effort: EffortOptions
-    dynamics: Section
-    expert: Section
-    planner: Section
-    tracker: Section
-    tracker_training: Section
-    propagator: Section
-    executor: Section
-    proof: Section
-    verify: Section
-    library: Section
-    execute: Section
-    safety: Section
-    dynamics_training: Section | None = None
-    planner_training: Section | None = None
-
-
-_SECTIONS = tuple(
-    f.name for f in fields(ConfigOptions) if f.type not in ("str", "Whole", "Count") and "None" not in str(f.type)
-)
 
 
 def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> None:
@@ -86,9 +24,7 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
     Raises:
         ConfigError: one line with every complaint.
     """
-    found = option_complaints(ConfigOptions, config, "")
-    if not all(isinstance(config.get(name), Mapping) for name in _SECTIONS):
-        raise ConfigError("; ".join(found))
+    found = outline_complaints(config)
     for section in KINDS:
         found += section_complaints(config[section], section)
     found += SECTION.complaints(config)
@@ -97,30 +33,11 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
             found += stage.complaints(config)
         except ConfigError as e:  # a name that nobody knows, which is among the complaints already
             found.append(str(e))
-    found += _source_complaints(config)
+    found += source_complaints(config)
     if problem and not any(complaint.startswith("dynamics") for complaint in found):
         found += _problem_complaints(config)
     if found:
         raise ConfigError("; ".join(dict.fromkeys(found)))
-
-
-def _source_complaints(config: Mapping[str, Any]) -> Iterator[str]:
-    sources, own = config["sources"], str(config["name"])
-    shared = [stage.name for stage in STAGES if any(stage.name in other.inputs for other in STAGES)]
-    experiments = options_of("experiment")
-    for stage, experiment in sources.items():
-        if stage not in shared:
-            near = did_you_mean(str(stage), shared) or f"; allowed: {', '.join(shared)}"
-            yield f"sources.{stage}: no stage whose file another one could use{near}"
-        if experiment is None:
-            continue
-        if experiment == own:
-            yield f"sources.{stage}: {own} is this experiment itself"
-        elif experiment not in experiments and (
-            stage not in shared or named_run_file(config, str(experiment), stage) is None
-        ):
-            near = did_you_mean(str(experiment), experiments) or f"; known: {', '.join(experiments)}"
-            yield f"sources.{stage}: no experiment '{experiment}'{near}, and no file of a run of that name"
 
 
 def _problem_complaints(config: Mapping[str, Any]) -> list[str]:

@@ -13,8 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sagemp_cli.config.binding import Binding, target_class
-from sagemp_cli.dynamics.learned import Learned
+from sagemp_cli.config.binding import NAME, Binding, attribute_of_target
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.storage import (
     Certificate,
@@ -149,17 +148,17 @@ class Stage:
 
 def _has_demonstrations(config: Mapping[str, Any]) -> bool:
     """Whether the planner learns from an expert; one of a file or one that teaches itself does not."""
-    return getattr(target_class(config["planner"], "planner"), "learns_from", None) == "demonstrations"
+    return attribute_of_target(config["planner"], "planner", "learns_from", None) == "demonstrations"
 
 
 def _learns_its_robot(config: Mapping[str, Any]) -> bool:
     """Whether the robot is a learned one."""
-    return target_class(config["dynamics"], "dynamics") is Learned
+    return config["dynamics"].get(NAME) == "learned"
 
 
 def _trains_its_tracker(config: Mapping[str, Any]) -> bool:
     """Whether the tracker is trained here; one that was trained elsewhere is taken as it is."""
-    return getattr(target_class(config["tracker"], "tracker"), "trains", True)
+    return attribute_of_target(config["tracker"], "tracker", "trains", True)
 
 
 def _references_file(config: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any, TypeVar
 
@@ -31,6 +31,8 @@ class Kind:
         built_in: ``module:class`` by name, of what comes with the package; imported when it is asked for.
         from_data: arguments that the stages give from the robot and the horizon; no config sets them.
         called_with: arguments that a plain function gets each time it is called; no config sets them.
+        said: class attributes of what is built in, by attribute and name, which the graph of stages asks for: torch
+            need not be imported to know them.
     """
 
     section: str
@@ -39,6 +41,7 @@ class Kind:
     built_in: Mapping[str, str]
     from_data: tuple[str, ...] = ()
     called_with: tuple[str, ...] = ()
+    said: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 _DATA = ("state_dim", "state_names", "control_dim", "horizon", "dt", "robot")
@@ -71,6 +74,15 @@ KINDS: Mapping[str, Kind] = {
             },
             from_data=_DATA,
             called_with=("start", "goal", "scene", "count", "generator"),
+            said={
+                "learns_from": {
+                    "diffusion": "demonstrations",
+                    "flow_matching": "demonstrations",
+                    "from_file": "nothing",
+                    "neural_ode": "demonstrations",
+                    "vlm": "scenes",
+                }
+            },
         ),
         Kind(
             "tracker",
@@ -78,6 +90,7 @@ KINDS: Mapping[str, Kind] = {
             "tracker",
             {"mlp": "sagemp_cli.loop.tracker:Tracker", "onnx": "sagemp_cli.loop.onnx_format.tracker:OnnxTracker"},
             from_data=_DATA,
+            said={"trains": {"mlp": True, "onnx": False}},
         ),
         Kind(
             "propagator",
@@ -185,6 +198,20 @@ def resolve(section: str, name: Any, where: str) -> Callable[..., Any]:
         f"{where}.name {name!r}: no such {kind.noun}{near}; known: {', '.join(known)}; "
         f"name the file that brings your own with --plugin FILE.py, or in conf/project.yaml"
     )
+
+
+def declared(section: str, name: Any, where: str, attribute: str, default: Any) -> Any:
+    """A class attribute of what stands behind a name; of what comes with the package without importing it.
+
+    Args:
+        section, name, where: as of :func:`resolve`.
+        attribute: one that the kind says, see :attr:`Kind.said`.
+        default: of a plugin that does not have it.
+    """
+    said = KINDS[section].said[attribute]
+    if isinstance(name, str) and name in said:
+        return said[name]
+    return getattr(resolve(section, name, where), attribute, default)
 
 
 def _loaded(entry: metadata.EntryPoint, kind: Kind) -> Callable[..., Any]:

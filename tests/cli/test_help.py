@@ -50,20 +50,39 @@ def test_examples_in_the_help_show_brackets_as_typed(sagemp):
     assert "jq '.files[].state'" in sagemp("status", "--help").stdout
 
 
-def test_help_imports_nothing_heavy_and_comes_at_once():
+def imported(*arguments, of, folder=None):
+    """Which of these modules a command imports."""
     script = (
         "import sys\n"
-        "sys.argv = ['sagemp', 'verify', '--help']\n"
+        f"sys.argv = ['sagemp', *{arguments!r}]\n"
         "from sagemp_cli.cli.main import main\n"
-        "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        f"print([m for m in {HEAVY!r} if m in sys.modules], file=sys.stderr)"
+        "try:\n    main()\nexcept SystemExit as e:\n    assert not e.code\n"
+        f"print([m for m in {of!r} if m in sys.modules], file=sys.stderr)"
     )
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=folder).stderr
+
+
+def test_help_imports_nothing_heavy_and_comes_at_once():
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    found = imported("verify", "--help", of=HEAVY)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert done.stderr.strip() == "[]"
+    assert found.strip() == "[]"
     # Processor time: what the clock shows on a machine that does nothing else.
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("status",),
+        ("status", "experiment=unicycle_vlm_avoid", "sources.train-tracker=kinematic_node"),
+        ("config", "list"),
+        ("config", "show"),
+    ],
+    ids=" ".join,
+)
+def test_what_only_looks_at_files_and_configs_imports_no_mathematics(arguments, tmp_path):
+    assert imported(*arguments, of=("torch", "scipy", "matplotlib", "sympy"), folder=tmp_path).strip() == "[]"
 
 
 def test_the_version_is_shown(sagemp):

@@ -10,13 +10,28 @@ import pytest
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.plugins import KINDS, planner, registry, robot
-from sagemp_cli.plugins.registry import from_outside, names, resolve
+from sagemp_cli.plugins.registry import declared, from_outside, names, resolve
 
 
 @pytest.mark.parametrize(("section", "name"), [(s, n) for s, kind in KINDS.items() for n in kind.built_in])
 def test_every_name_of_the_package_is_a_class_of_it(section, name):
     found = resolve(section, name, section)
     assert inspect.isclass(found) and found.__module__.startswith("sagemp_cli.")
+
+
+@pytest.mark.parametrize(
+    ("section", "attribute"), [(s, attribute) for s, kind in KINDS.items() for attribute in kind.said]
+)
+def test_what_the_table_says_of_a_class_the_class_says_itself(section, attribute):
+    kind = KINDS[section]
+    assert kind.said[attribute] == {name: getattr(resolve(section, name, section), attribute) for name in kind.built_in}
+
+
+def test_what_a_plugin_says_of_itself_counts(folder):
+    planner("pupil")(type("Pupil", (), {"learns_from": "demonstrations"}))
+    planner("plain")(lambda: None)
+    assert declared("planner", "pupil", "planner", "learns_from", None) == "demonstrations"
+    assert declared("planner", "plain", "planner", "learns_from", None) is None
 
 
 def test_what_is_registered_is_found_under_its_name(folder):
