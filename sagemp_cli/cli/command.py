@@ -55,10 +55,22 @@ def examples(*lines: str) -> str:
     return "\n\n".join(["[bold]Examples[/bold]", *(f"$ {line.replace('[', chr(92) + '[')}" for line in lines)])
 
 
-def flowing(function: Callable[..., Any]) -> str:
-    """A docstring as help text: paragraphs without line breaks, so that they fill the terminal's width."""
-    paragraphs = (inspect.getdoc(function) or "").split("\n\n")
-    return "\n\n".join(" ".join(p.split()) for p in paragraphs)
+def add_command(
+    app: typer.Typer, name: str, function: Callable[..., Any], *, help: str, epilog: str, panel: str
+) -> None:
+    """Add a command to a group.
+
+    Args:
+        app: the group.
+        name: of the command.
+        function: what it does; its parameters are the options.
+        help: a docstring.
+        epilog: :func:`examples`.
+        panel: of the group's help that it is listed in.
+    """
+    paragraphs = inspect.cleandoc(help).split("\n\n")  # without line breaks in them they fill the terminal's width
+    flowing = "\n\n".join(" ".join(p.split()) for p in paragraphs)
+    app.command(name, cls=Command, help=flowing, epilog=epilog, rich_help_panel=panel)(function)
 
 
 def printable(text: str) -> str:

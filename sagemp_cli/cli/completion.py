@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import typer
 
 from sagemp_cli.errors import SagempError
@@ -32,6 +34,7 @@ def complete_override(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def complete_stage(ctx: typer.Context, incomplete: str) -> list[str]:
     """Stages that begin with what is typed."""
-    commands = getattr(ctx.find_root().command, "commands", {})
-    stages = [name for name, command in commands.items() if getattr(command, "rich_help_panel", None) == PIPELINE]
+    root: Any = ctx.find_root().command
+    stages = [name for name, command in root.commands.items() if command.rich_help_panel == PIPELINE]
+    stages += [name for name in root.list_commands(ctx) if name not in root.commands]
     return [name for name in stages if name.startswith(incomplete)]

@@ -14,23 +14,22 @@ from sagemp_cli.cli import (
     doctor,
     execute,
     export,
-    gen_data,
     init,
     inspect,
     prove,
     run,
     safety_rates,
     status,
-    train_dynamics,
-    train_planner,
-    train_tracker,
     verify,
 )
-from sagemp_cli.cli.command import Command, errors_as_lines, examples, flowing
+from sagemp_cli.cli.command import add_command, errors_as_lines, examples
 from sagemp_cli.cli.completion import PIPELINE
+from sagemp_cli.cli.plain_stages import PLAIN, function_of
+from sagemp_cli.cli.stages_from_outside import Commands
 
 app = typer.Typer(
     name="sagemp",
+    cls=Commands,
     rich_markup_mode="rich",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -45,11 +44,9 @@ app = typer.Typer(
 )
 
 _PIPELINE, _AROUND = PIPELINE, "Around it"
+for _stage in PLAIN:
+    add_command(app, _stage.name, function_of(_stage.name), help=_stage.help, epilog=_stage.epilog, panel=_PIPELINE)
 for _name, _function, _examples, _panel in (
-    ("gen-data", gen_data.gen_data, gen_data.EXAMPLES, _PIPELINE),
-    ("train-dynamics", train_dynamics.train_dynamics, train_dynamics.EXAMPLES, _PIPELINE),
-    ("train-planner", train_planner.train_planner, train_planner.EXAMPLES, _PIPELINE),
-    ("train-tracker", train_tracker.train_tracker, train_tracker.EXAMPLES, _PIPELINE),
     ("verify", verify.verify, verify.EXAMPLES, _PIPELINE),
     ("build-library", build_library.build_library, build_library.EXAMPLES, _PIPELINE),
     ("execute", execute.execute, execute.EXAMPLES, _PIPELINE),
@@ -62,7 +59,7 @@ for _name, _function, _examples, _panel in (
     ("inspect", inspect.inspect, inspect.EXAMPLES, _AROUND),
     ("doctor", doctor.doctor, doctor.EXAMPLES, _AROUND),
 ):
-    app.command(_name, cls=Command, help=flowing(_function), epilog=_examples, rich_help_panel=_panel)(_function)
+    add_command(app, _name, _function, help=_function.__doc__ or "", epilog=_examples, panel=_panel)
 app.add_typer(config.app, name="config", rich_help_panel=_AROUND)
 app.add_typer(export.app, name="export", rich_help_panel=_AROUND)
 
@@ -71,6 +68,16 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"sagemp {__version__}")
         raise typer.Exit
+
+
+def _load_plugins(plugins: list[str] | None) -> list[str] | None:
+    """Before the command is looked up, which a plugin may bring."""
+    if plugins:
+        from sagemp_cli.plugins.loading import load_all
+
+        with errors_as_lines():
+            load_all(plugins)
+    return plugins
 
 
 @app.callback()
@@ -82,6 +89,8 @@ def sagemp(
         list[str] | None,
         typer.Option(
             metavar="FILE",
+            callback=_load_plugins,
+            is_eager=True,
             help="A Python file or module that brings a robot, planner, ... of your own; may be given several times.",
             show_default=False,
         ),
@@ -91,11 +100,6 @@ def sagemp(
 
     Every command reads and writes HDF5 files in artifacts/ and takes config overrides as KEY=VALUE.
     """
-    if plugin:
-        from sagemp_cli.plugins.loading import load_all
-
-        with errors_as_lines():
-            load_all(plugin)
 
 
 def main() -> None:

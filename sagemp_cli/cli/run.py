@@ -54,9 +54,9 @@ def run(
     5 unknown.
     """
     from sagemp_cli.cli import verdict
-    from sagemp_cli.pipeline.stage import STAGES, stages_of
+    from sagemp_cli.pipeline.stage import all_stages, stages_of
 
-    names = [stage.name for stage in STAGES]
+    names = [stage.name for stage in all_stages()]
     if until is not None and until not in names:
         raise UsageError(f"--until {until}: no such stage{did_you_mean(until, names)}; known: {', '.join(names)}")
     context = context_of(overrides_of(overrides, seed=seed, partitions=partitions), overwrite=True)

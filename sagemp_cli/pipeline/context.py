@@ -154,6 +154,10 @@ class StageContext:
                 )
         return artifact
 
+    def inputs_of(self, stage: str) -> dict[str, Artifact[Any]]:
+        """The files that a stage reads under this config, by the stages that make them, see :meth:`read`."""
+        return {name: self.read(name) for name in stage_named(stage).inputs_in(self.config)}
+
     def as_source(self, stage: str, key: str) -> str:
         """How trained files serve another problem as they are, as the end of a list of remedies; empty if they cannot.
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.context import StageContext
-from sagemp_cli.pipeline.stage import STAGES, Stage, stages_of
+from sagemp_cli.pipeline.stage import Stage, all_stages, stages_of
 from sagemp_cli.reading.regular import is_there, sha256_if_there
 from sagemp_cli.storage import Header, open_header, sha256_of
-from sagemp_cli.storage.kinds import KINDS
+from sagemp_cli.storage.kinds import kind_of
 
 
 class Freshness(StrEnum):
@@ -70,8 +70,8 @@ def _state_of(stage: Stage, context: StageContext, before: Mapping[str, FileStat
         return FileState(stage, path, Freshness.MISSING, f"make it with 'sagemp {stage.name}'")
     try:
         kind, header = open_header(path)
-        wanted = next(k for k in KINDS if k.record is stage.record)
-        if kind is not wanted:
+        wanted = kind_of(stage.record)
+        if kind != wanted:
             raise ArtifactError(f"{path}: is an artifact of kind '{kind.name}', '{wanted.name}' is needed here")
     except ArtifactError as e:
         return FileState(stage, path, Freshness.DAMAGED, str(e).removeprefix(f"{path}: "))
@@ -105,7 +105,7 @@ def _file_change(header: Header, context: StageContext) -> str:
     """Of files that no stage made, e.g. one of references; one that is gone cannot contradict what was made from it."""
     for parent in header.parents:
         source = context.folder / parent.path
-        foreign = parent.role not in {stage.role for stage in STAGES}
+        foreign = parent.role not in {stage.role for stage in all_stages()}
         if foreign and sha256_if_there(source) not in (None, parent.sha256):
             return f"{source.name} has changed since"
     return ""

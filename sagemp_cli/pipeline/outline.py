@@ -14,7 +14,8 @@ from sagemp_cli.config.composition import options_of
 from sagemp_cli.config.ranges import Count, Whole
 from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.pipeline.context import named_run_file
-from sagemp_cli.pipeline.stage import STAGES
+from sagemp_cli.pipeline.stage import all_stages
+from sagemp_cli.plugins.stages import own_stages
 
 Section = Mapping[str, Any]
 
@@ -88,12 +89,13 @@ def require_sound_outline(config: Mapping[str, Any]) -> None:
 
 
 def outline_complaints(config: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the keys at the top.
+    """What is wrong with the keys at the top; what is in a section of a stage from outside is that stage's affair.
 
     Raises:
         ConfigError: a section is none, so that no more can be said; one line with every complaint.
     """
-    found = option_complaints(ConfigOptions, config, "")
+    own = {stage.section for stage in own_stages()}
+    found = option_complaints(ConfigOptions, {key: config[key] for key in config if key not in own}, "")
     if not all(isinstance(config.get(name), Mapping) for name in _SECTIONS):
         raise ConfigError("; ".join(found))
     return found
@@ -102,7 +104,8 @@ def outline_complaints(config: Mapping[str, Any]) -> list[str]:
 def source_complaints(config: Mapping[str, Any]) -> Iterator[str]:
     """What is wrong with the section ``sources``."""
     sources, own = config["sources"], str(config["name"])
-    shared = [stage.name for stage in STAGES if any(stage.name in other.inputs for other in STAGES)]
+    every = all_stages()
+    shared = [stage.name for stage in every if any(stage.name in other.inputs for other in every)]
     experiments = options_of("experiment")
     for stage, experiment in sources.items():
         if stage not in shared:

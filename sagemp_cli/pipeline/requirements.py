@@ -10,7 +10,7 @@ from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.pipeline.outline import outline_complaints, source_complaints
 from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.pipeline.proof import SECTION, counts_of
-from sagemp_cli.pipeline.stage import STAGES
+from sagemp_cli.pipeline.stage import all_stages
 from sagemp_cli.plugins import KINDS
 
 
@@ -28,7 +28,7 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
     for section in KINDS:
         found += section_complaints(config[section], section)
     found += SECTION.complaints(config)
-    for stage in STAGES:
+    for stage in all_stages():
         try:
             found += stage.complaints(config)
         except ConfigError as e:  # a name that nobody knows, which is among the complaints already

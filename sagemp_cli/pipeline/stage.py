@@ -1,7 +1,8 @@
 """What a stage is: which files it reads, which file it writes, which config keys its output depends on.
 
 A stage opens artifacts, builds objects from config, calls the core and writes one file; the mathematics is
-elsewhere. The table :data:`STAGES` is all that ``run``, ``status`` and the commands know about them.
+elsewhere. The table :data:`STAGES`, and what plugins add to it, is all that ``run``, ``status`` and the commands know
+about them.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from sagemp_cli.config.binding import NAME, Binding, attribute_of_target
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.errors import ConfigError, did_you_mean
+from sagemp_cli.pipeline.own_stage import OwnVerb
+from sagemp_cli.plugins.stages import OwnStage, own_stages
 from sagemp_cli.storage import (
     Certificate,
     Demonstrations,
@@ -47,6 +49,7 @@ class Stage:
         variant: what distinguishes its output from the experiment's own, from its config; empty if nothing does.
         seed: dotted key of its seed; that of a stage that only samples is its own, and another one is no contradiction
             to what reads its file.
+        own: of a stage from outside what it does; None for those in :mod:`sagemp_cli.stages`.
     """
 
     name: str
@@ -59,6 +62,7 @@ class Stage:
     applies: Callable[[Mapping[str, Any]], bool] = lambda config: True
     variant: Callable[[Mapping[str, Any]], str] = lambda config: ""
     seed: str = "seed"
+    own: OwnVerb | None = None
 
     def output_in(self, config: Mapping[str, Any]) -> str:
         """File name of what it writes under a config."""
@@ -113,7 +117,7 @@ class Stage:
     def draw(self, context: StageContext) -> Path | None:
         """Draw the figure of the stage's file, which is there (``sagemp_cli.stages.<name>.draw``); return its path.
 
-        None if there is nothing to draw: a tracker that was trained elsewhere has no curve.
+        None if there is nothing to draw: a tracker that was trained elsewhere, a stage from outside.
         """
         return self._module.draw(context)
 
@@ -142,8 +146,8 @@ class Stage:
         return [complaint for binding in self.bindings(config) for complaint in binding.complaints(config)]
 
     @property
-    def _module(self) -> ModuleType:
-        return importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}")
+    def _module(self) -> Any:
+        return self.own or importlib.import_module(f"sagemp_cli.stages.{self.name.replace('-', '_')}")
 
 
 def _has_demonstrations(config: Mapping[str, Any]) -> bool:
@@ -232,26 +236,49 @@ STAGES = (
 )
 
 
+def all_stages() -> tuple[Stage, ...]:
+    """Those of the package and then those from outside, each after what it reads.
+
+    Raises:
+        ConfigError: one from outside reads what no stage before it writes.
+    """
+    found = list(STAGES)
+    for own in own_stages():
+        names = [stage.name for stage in found]
+        for wanted in own.inputs:
+            if wanted not in names:
+                near = did_you_mean(wanted, names) or f"; known before it: {', '.join(names)}"
+                raise ConfigError(f"stage '{own.name}': no stage '{wanted}' whose file it could read{near}")
+        found.append(_from_outside(own))
+    return tuple(found)
+
+
+def _from_outside(own: OwnStage) -> Stage:
+    sections = (*_ROBOT, *own.sections, own.section, "seed")
+    return Stage(own.name, f"{own.name}.h5", own.record, own.inputs, sections, own=OwnVerb(own))
+
+
 def stage_named(name: str) -> Stage:
     """The stage of a command."""
-    return next(s for s in STAGES if s.name == name)
+    known = next((s for s in STAGES if s.name == name), None)
+    return known or next(s for s in all_stages() if s.name == name)
 
 
-def stages_of(config: Mapping[str, Any], last: tuple[str, ...] = ("verify", "build-library", "execute")) -> list[Stage]:
+def stages_of(config: Mapping[str, Any], last: Sequence[str] | None = None) -> list[Stage]:
     """The stages that an experiment's ``last`` ones need, in order, themselves included.
 
-    Those that are not among the default ``last`` ones are made only when they are asked for by name. Of a stage whose
-    file another experiment makes, the inputs are that experiment's affair.
+    By default these are verify, build-library and execute, and those from outside; others are made only when they are
+    asked for by name. Of a stage whose file another experiment makes, the inputs are that experiment's affair.
     """
-    needed: set[str] = set()
-    waiting = list(last)
+    every, needed = all_stages(), set[str]()
+    waiting = list(last or ("verify", "build-library", "execute", *(s.name for s in every if s.own)))
     while waiting:
         name = waiting.pop()
         if name not in needed:
             needed.add(name)
             if config["sources"].get(name) is None:
                 waiting += stage_named(name).inputs_in(config)
-    return [stage for stage in STAGES if stage.name in needed]
+    return [stage for stage in every if stage.name in needed]
 
 
 def _value(config: Mapping[str, Any], dotted: str, *, without: Sequence[str]) -> Any:

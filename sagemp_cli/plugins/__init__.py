@@ -13,5 +13,6 @@ It is found if it is named on the command line (``sagemp --plugin my_robot.py ..
 """
 
 from sagemp_cli.plugins.registry import KINDS, Kind, executor, planner, propagator, robot, tracker
+from sagemp_cli.plugins.stages import stage
 
-__all__ = ["KINDS", "Kind", "executor", "planner", "propagator", "robot", "tracker"]
+__all__ = ["KINDS", "Kind", "executor", "planner", "propagator", "robot", "stage", "tracker"]

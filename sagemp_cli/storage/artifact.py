@@ -28,7 +28,7 @@ from sagemp_cli.reading.reader import read_tree
 from sagemp_cli.reading.tree import Group
 from sagemp_cli.storage.atomic import hdf5_image, reason_of, refuse_existing, write_whole
 from sagemp_cli.storage.content import HASH_ATTRIBUTE, ContentError, content_hash
-from sagemp_cli.storage.kinds import KINDS, Kind, kind_of
+from sagemp_cli.storage.kinds import KINDS, Kind, kind_of, own_kinds
 from sagemp_cli.storage.record import group_of, read_record, write_record
 
 R = TypeVar("R")
@@ -114,7 +114,7 @@ def write_artifact(path: Path, record: Any, header: Header, *, overwrite: bool =
         NonFiniteError: a NaN or an infinity where the declaration allows none.
         ResourceError: the folder cannot be written or the disk is full; nothing is left behind.
     """
-    kind = kind_of(record)
+    kind = kind_of(type(record))
     refuse_existing(path, overwrite)
 
     def fill(file: h5py.File) -> None:
@@ -132,9 +132,9 @@ def read_artifact(path: Path, record: type[R]) -> Artifact[R]:
         ArtifactError: missing, not HDF5, cut off, of another kind, of a newer format, or not as declared.
         NonFiniteError: NaN or infinity where the declaration allows none.
     """
-    wanted, (tree, sha256) = next(k for k in KINDS if k.record is record), read_tree(path)
+    wanted, (tree, sha256) = kind_of(record), read_tree(path)
     kind, header = _header(tree, path)
-    if kind is not wanted:
+    if kind != wanted:
         raise ArtifactError(f"{path}: is an artifact of kind '{kind.name}', '{wanted.name}' is needed here")
     return _artifact(path, sha256, kind, header, tree)
 
@@ -197,6 +197,8 @@ def _write_header(file: h5py.File, kind: Kind, header: Header) -> None:
 def _read_header(file: Group, path: Path) -> tuple[Kind, Header]:
     schema = str(file.attrs.get("schema", ""))
     known = {f"sagemp/{k.name}": k for k in KINDS}
+    if schema not in known:
+        known |= {f"sagemp/{k.name}": k for k in own_kinds()}
     if schema not in known:
         raise ArtifactError(
             f"{path}: not an artifact of sagemp (schema '{schema or 'none'}'; known: {', '.join(known)})"

@@ -8,11 +8,12 @@ not measured NaN.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
 
+from sagemp_cli.errors import ConfigError
+from sagemp_cli.plugins.stages import own_stages
 from sagemp_cli.storage.record import array, group, scalar, texts, weights
 
 
@@ -308,6 +309,24 @@ KINDS = (
 )
 
 
-def kind_of(record: Any) -> Kind:
-    """The kind that a record object belongs to."""
-    return next(k for k in KINDS if type(record) is k.record)
+def own_kinds() -> tuple[Kind, ...]:
+    """The kinds of what stages from outside write, see :mod:`sagemp_cli.plugins.stages`.
+
+    Raises:
+        ConfigError: a stage's record is not declared as one.
+    """
+    found = own_stages()
+    for stage in found:
+        declared = is_dataclass(stage.record) and all("form" in f.metadata for f in fields(stage.record))
+        if not declared or stage.record in [k.record for k in KINDS]:
+            raise ConfigError(
+                f"stage '{stage.name}': its record must be a dataclass of its own, with fields declared by array, "
+                "texts, scalar, weights or group of sagemp_cli.storage.record"
+            )
+    return tuple(Kind(stage.name, 1, stage.record) for stage in found)
+
+
+def kind_of(record: type) -> Kind:
+    """The kind that a record class belongs to."""
+    known = next((k for k in KINDS if k.record is record), None)
+    return known or next(k for k in own_kinds() if k.record is record)

@@ -217,7 +217,7 @@ def _numeric(node: Group, name: str, label: str) -> np.ndarray:
 
 def _scalar(label: str, declared: Any, value: Any) -> Any:
     """The value if it is of the declared type (``"str"``, ``"int"``, ``"float"`` or ``"bool"``)."""
-    name = str(declared).removesuffix(" | None")
+    name = getattr(declared, "__name__", str(declared)).removesuffix(" | None")
     value = value.item() if isinstance(value, np.generic) else value
     if not isinstance(value, _SCALARS[name]) or (isinstance(value, bool) and name != "bool"):
         raise ArtifactError(f"{label} must be of type {name}, found {type(value).__name__}")

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sagemp_cli.plugins import registry
+from sagemp_cli.plugins import registry, stages
 
 
 @pytest.fixture
@@ -14,6 +14,7 @@ def folder(tmp_path, monkeypatch):
     """The working directory of the test; what it registers and imports is forgotten."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
+    monkeypatch.setattr(stages, "_registered", dict(stages._registered))
     monkeypatch.setattr(sys, "path", list(sys.path))
     before = set(sys.modules)
     yield tmp_path
