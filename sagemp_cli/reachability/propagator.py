@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol
 
 from torch import Tensor
 
+from sagemp_cli.reachability.flow import Flow
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
 
@@ -39,6 +40,7 @@ class Reach:
         control_lower, control_upper: bounds of the controls per step, ``(..., K, m)``.
         recording: what a certificate keeps of the proof.
         notes: what whoever reads the tube should know, one line each.
+        flow: of a loop in continuous time, what was proved between the instants.
     """
 
     tube: Tube
@@ -46,6 +48,7 @@ class Reach:
     control_upper: Tensor | None = None
     recording: Recording | None = None
     notes: tuple[str, ...] = ()
+    flow: Flow | None = None
 
 
 @dataclass(frozen=True)

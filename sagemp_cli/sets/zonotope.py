@@ -82,7 +82,7 @@ class Zonotope:
             matrix: ``(B, m, n)``, or for all cells ``(1, m, n)``.
             center: ``(B, m)``.
             fresh: ``(B, m, l)`` or ``(1, m, l)``.
-            radius: ``(l,)``.
+            radius: ``(l,)`` or ``(B, 1, l)``.
             rounding: ``(B, m)``.
         """
         if not isinstance(center, np.ndarray):

@@ -48,6 +48,7 @@ class AffineRun:
         steps: per step, what a backward pass needs of it; empty unless asked for.
         watched_lower, watched_upper: bounds of controls and deviations ``(*batch, K, m)``; None unless asked for.
         notes: what whoever reads the tube should know.
+        last: the set after the last step, for all B cells.
     """
 
     tube: Tube
@@ -57,6 +58,7 @@ class AffineRun:
     watched_lower: Tensor | None = None
     watched_upper: Tensor | None = None
     notes: tuple[str, ...] = ()
+    last: Zonotope | None = field(default=None, repr=False)
 
     @property
     def alike(self) -> bool:
@@ -120,27 +122,31 @@ class Affine(Propagator):
         keep_steps: bool = False,
         hints: Sequence[Hints] | None = None,
         watch: bool = False,
+        states: Zonotope | None = None,
     ) -> AffineRun:
         """Propagate, and keep what else is asked for; differentiable where autograd is on and something wants it.
 
         Args:
-            loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`.
+            loop, start, disturbance: see :class:`~sagemp_cli.reachability.propagator.Propagator`; or of the disturbance
+                one box for each step and cell of the batch, ``(K, B, d)``.
             horizon: steps; the loop's by default.
             keep_steps: keep every step, for a backward pass.
             hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
             watch: bound the controls, and the deviations of a learned robot that is compared with its model.
+            states: the set to begin with, of arrays, for all B cells, where that is more than its box ``start``.
 
         Raises:
             UsageError: a loop that is to be watched does not say what its controls are.
         """
-        known, start = recorded_and_batched(loop, start, disturbance)
+        known, start = recorded_and_batched(loop, start, disturbance, varying=True)
         if watch and any(p.outputs.control is None for p in known.programs):
             raise UsageError(f"{type(loop).__name__} has a step of its own, which does not say what its controls are")
         differentiated = torch.is_grad_enabled() and _wants_gradient(known, start, disturbance)
         batch, n = start.lower.shape[:-1], start.dim
         steps = Steps(known, disturbance, batch, tensors=differentiated)
         whole = Zonotope(start.center.reshape(-1, n), torch.diag_embed(start.radius.reshape(-1, n)))
-        states = whole if differentiated else Zonotope(whole.center.numpy(), whole.generators.numpy())
+        if states is None:
+            states = whole if differentiated else Zonotope(whole.center.numpy(), whole.generators.numpy())
 
         lows, highs, bands, masks, controls, kept, again = [], [], [], [], [], [], 0
         boxed = Boxed(self.symbols)
@@ -173,7 +179,7 @@ class Affine(Propagator):
             *(torch.cat([f[..., None, :], s], -2) for f, s in zip((start.lower, start.upper), sides, strict=True))
         )
         low, high = [_in_batch(side, batch) for side in zip(*controls, strict=True)] or (None, None)
-        return AffineRun(tube, bands, masks, kept, low, high, boxed.notes())
+        return AffineRun(tube, bands, masks, kept, low, high, boxed.notes(), states)
 
 
 def _in_batch(steps: Sequence[Any], batch: torch.Size) -> Tensor:

@@ -129,7 +129,7 @@ class Frame:
     Args:
         states: the set, one for each of B cells.
         inputs: how many states and disturbances there are.
-        own_radius: radii of all variables that a step has but the states.
+        own_radius: radii of all variables that a step has but the states, ``(v,)`` or for each cell ``(B, 1, v)``.
         hints: what is known of the operations.
 
     Attributes:
@@ -162,7 +162,7 @@ class Frame:
             after.coefficients[..., :n],
             after.both[0],
             fresh=own,
-            radius=self.own_radius[: own.shape[-1]],
+            radius=self.own_radius[..., : own.shape[-1]],
             rounding=self.rounding(after),
         )
 
@@ -170,14 +170,15 @@ class Frame:
         """A vector in terms of all symbols, ``(B, e, symbols)``; of tensors."""
         n = self.both.shape[-1]
         of_state, own = coefficients[..., :n] @ self.states.generators, coefficients[..., n:]
-        scaled = own * self.own_radius[: own.shape[-1]]
+        scaled = own * self.own_radius[..., : own.shape[-1]]
         return self._m.cat([of_state, scaled.expand(len(of_state), -1, -1)], -1)
 
     def radius(self, coefficients: Array) -> Array:
         """Sums of the magnitudes of a vector's coefficients over all symbols, ``(B, e)``, but for rounding."""
         n, generators = self.both.shape[-1], self.states.generators
         of_state, own = coefficients[..., :n], coefficients[..., n:]
-        radius = abs(own) @ self.own_radius[: own.shape[-1]]
+        sizes = self.own_radius[..., : own.shape[-1]]
+        radius = abs(own) @ sizes if sizes.ndim == 1 else (abs(own) * sizes).sum(-1)
         if not isinstance(of_state, np.ndarray):
             return abs(of_state @ generators).sum(-1) + radius
         block = max(_BLOCK // (len(generators) * coefficients.shape[-2]), 64)

@@ -47,7 +47,7 @@ class Steps:
 
     Args:
         loop: what steps.
-        disturbance: W.
+        disturbance: W, ``(d,)``; or one box for each step and cell, ``(K, B, d)``.
         cells: shape of the batch of cells; the loop's own batch broadcasts to it.
         tensors: whether to compute with tensors.
     """
@@ -57,18 +57,19 @@ class Steps:
         self._numbers = numbers.flatten(1, -2)
         self._disturbance, self._tensors = disturbance, tensors
         self._ready = [_Ready(p, self._numbers, disturbance, tensors=tensors) for p in loop.programs]
+        self._varies = disturbance.lower.dim() > 1
 
     def evaluate(self, k: int, states: Zonotope, hints: Hints | None) -> tuple[Frame, Value, Value | None]:
         """Step k from a set: its frame, the next state, and control and deviation if the loop says them."""
         ready = self._of(k)
-        frame = Frame(states, inputs=ready.inputs, own_radius=ready.own_radius, hints=hints)
+        frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=hints)
         after, watched = ready.evaluate(k, frame)
         if not math.isfinite(after.both.sum().item()):
             m = functions_of(after.both)
             lost = m.isfinite(states.reach).all(-1) & ~m.isfinite(after.both).all(0).all(-1)
             if bool(lost.any()):  # an operation's domain was left: intervals may know better
                 known = sharper(self._operands(k, states), hints, where=torch.as_tensor(lost))
-                frame = Frame(states, inputs=ready.inputs, own_radius=ready.own_radius, hints=known)
+                frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=known)
                 after, watched = ready.evaluate(k, frame)
         return frame, after, watched
 
@@ -76,7 +77,8 @@ class Steps:
         """What intervals know of step k's operations."""
         low, high = (torch.as_tensor(side).detach() for side in (states.low, states.high))
         numbers = self._numbers[k].detach()
-        given = ((low, high), (self._disturbance.lower, self._disturbance.upper), (numbers, numbers))
+        disturbance = [s[k] if self._varies else s for s in (self._disturbance.lower, self._disturbance.upper)]
+        given = ((low, high), disturbance, (numbers, numbers))
         with torch.no_grad():
             return operands(self._of(k).program, *(IntervalForm(*sides) for sides in given))
 
@@ -91,8 +93,9 @@ class _Ready:
         self.program = program
         step = compiled(program)
         self.inputs = step.states + step.disturbances
-        ones = disturbance.radius.new_ones(sum(node.size for node in step.nodes))
-        self.own_radius = _placed(torch.cat([disturbance.radius, ones]), tensors)
+        radius = disturbance.radius
+        ones = radius.new_ones(*radius.shape[:-1], sum(node.size for node in step.nodes))
+        self._own_radius = _placed(torch.cat([radius, ones], -1), tensors)
 
         def fold(combination: Combination) -> _Fold:
             return _Fold(step, combination, numbers, disturbance, tensors=tensors)
@@ -101,6 +104,10 @@ class _Ready:
         self._pairs = _pairs(step.nodes)
         self._next = fold(step.outputs.next)
         self._watched = None if step.watched is None else fold(step.watched)
+
+    def radius_at(self, k: int) -> Array:
+        """Radii of the variables of step k but the states, see :class:`.Frame`."""
+        return self._own_radius if self._own_radius.ndim == 1 else self._own_radius[k][:, None]
 
     def evaluate(self, k: int, frame: Frame) -> tuple[Value, Value | None]:
         results: list[Value] = []
@@ -156,9 +163,12 @@ class _Fold:
         w = disturbance.center
         constant = matrix[0][:, 0] + linear(w, matrix[3])
         size = sizes[0][:, 0] + linear(w.abs() + disturbance.radius + TINY, sizes[3]) + TINY
-        self._varies = used[1]
+        self._varies = used[1] or (used[3] and w.dim() > 1)
+        if not self._varies and w.dim() > 1:
+            constant, size = constant[0, 0], size[0, 0]
         if used[1]:
             constant, size = constant + linear(numbers, matrix[1]), size + linear(numbers.abs(), sizes[1])
+        if self._varies:
             self._constant = _placed(torch.stack([constant, size], dim=1), tensors)
         else:
             self._constant = _placed(torch.stack([constant, size])[:, None], tensors)

@@ -1,0 +1,1 @@
+"""Loops in continuous time: an ODE under a sampled, held control."""

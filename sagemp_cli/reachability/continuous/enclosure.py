@@ -1,0 +1,154 @@
+"""What a flow does within a part of a period, by intervals: where it stays, and what its Taylor polynomial leaves out.
+
+``docs/continuous_time.md`` derives all bounds and proves them. Of a part of length h that begins in a box B, with
+controls in U and ``r_W`` the radius of W:
+
+- ``X`` contains every solution if ``B + [0, h] (f(X, U) + W)`` lies in X (Picard and Lindelöf's operator).
+- With ``A >= |Df|`` on X and U, ``e >= A (h^2/4 r_W + h e)`` bounds how far a solution under ``w(t)`` is from the one
+  under the mean of w, but for what they differ by because the integrals of both w do.
+- The remainder lies in ``h^{p+1} c_{p+1}(X, U, W) + [-e, e]``.
+
+Everything is for all parts of all periods and cells at once, and rounded outwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.continuous.expansion import Expansion
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
+from sagemp_cli.sets import Box, round_down, round_up
+from sagemp_cli.sets.rounding import TINY
+
+_ROUNDS = 12
+"""Attempts to find a box that a flow does not leave."""
+_GROWTH = 0.1
+"""Share of its own width that an attempt is widened by."""
+
+
+@dataclass(frozen=True)
+class Enclosure:
+    """Of N parts; infinite where nothing was found.
+
+    Attributes:
+        lower, upper: a box that the flow does not leave, ``(N, n)``.
+        remainder_lower, remainder_upper: what the polynomial leaves out, ``(N, n)``.
+        curve: bound of ``h^2 / 2 |y''|`` of the solutions y under constant w, ``(N, n)``.
+        drift: e, ``(N, n)``.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    remainder_lower: Tensor
+    remainder_upper: Tensor
+    curve: Tensor
+    drift: Tensor
+
+    @property
+    def found(self) -> Tensor:
+        """Whether there is one, ``(N,)``."""
+        return torch.isfinite(self.remainder_lower).all(-1) & torch.isfinite(self.remainder_upper).all(-1)
+
+
+@torch.no_grad()
+def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> Enclosure:
+    """Of N parts that begin in these states ``(N, n)`` under these controls ``(N, m)``."""
+    stay = _a_priori(programs, state, control, w)
+    inside = _flowed(programs, state, stay, control, w)  # as an image it is no larger than what it was found in
+    n, h, p = state.lower.shape[-1], programs.length, programs.division.order
+    given = IntervalForm(w.lower, w.upper)
+    (found,) = _outputs(programs.coefficients, inside, given, control)
+    second, last = (IntervalForm(found.lower[:, i : i + n], found.upper[:, i : i + n]) for i in (0, (p > 1) * n))
+    drift = _drift(_slopes(programs, inside, control), w.radius, h)
+    power = round_up(torch.tensor(h**p, dtype=torch.float64) * h * (1 + 1e-12)), h**p * h * (1 - 1e-12)
+    low, high = _times(last, power[1], float(power[0]))
+    curve = round_up(torch.maximum(second.lower.abs(), second.upper.abs()) * (h * h * (1 + 1e-12)))
+    return Enclosure(stay.lower, stay.upper, round_down(low - drift), round_up(high + drift), _number(curve), drift)
+
+
+def _number(bound: Tensor) -> Tensor:
+    return torch.nan_to_num(bound, nan=torch.inf)
+
+
+def _times(a: IntervalForm, least: float, most: float) -> tuple[Tensor, Tensor]:
+    """An interval times a positive number between two that are known."""
+    low = torch.minimum(a.lower * least, a.lower * most)
+    high = torch.maximum(a.upper * least, a.upper * most)
+    return torch.nan_to_num(round_down(low), nan=-torch.inf), torch.nan_to_num(round_up(high), nan=torch.inf)
+
+
+def _outputs(program, state: IntervalForm, w: IntervalForm, numbers: IntervalForm | None) -> tuple[IntervalForm]:
+    """Of a program, the output ``control``, for all N parts."""
+    found = program.run(state, w, numbers, evaluate=evaluate).control
+    batch = torch.broadcast_shapes(found.lower.shape[:-1], state.lower.shape[:-1])
+    return (IntervalForm(*(side.expand(*batch, -1) for side in found.bounds)),)
+
+
+def _flowed(
+    programs: Expansion, state: IntervalForm, stay: IntervalForm, control: IntervalForm | None, w: Box
+) -> IntervalForm:
+    """``B + [0, h] (f(X, U) + W)``, within X where that is smaller."""
+    rate = programs.rate.run(stay, IntervalForm(w.lower, w.upper), control, evaluate=evaluate).next
+    low, high = round_down(rate.lower + w.lower), round_up(rate.upper + w.upper)
+    low, high = low.clamp(max=0.0) * programs.length, high.clamp(min=0.0) * programs.length
+    return IntervalForm(round_down(state.lower + round_down(low)), round_up(state.upper + round_up(high)))
+
+
+def _a_priori(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> IntervalForm:
+    """A box that no solution leaves within the part, ``(N, n)``; infinite where none was found."""
+    trial = _widened(state, _flowed(programs, state, state, control, w))
+    kept = torch.zeros(state.lower.shape[:-1], dtype=torch.bool)
+    for _ in range(_ROUNDS):
+        after = _flowed(programs, state, trial, control, w)
+        kept = ((trial.lower <= after.lower) & (after.upper <= trial.upper)).all(-1)
+        kept &= torch.isfinite(trial.lower).all(-1) & torch.isfinite(trial.upper).all(-1)
+        if bool(kept.all()):
+            return trial
+        wider, fixed = _widened(state, after), kept[..., None]
+        trial = IntervalForm(torch.where(fixed, trial.lower, wider.lower), torch.where(fixed, trial.upper, wider.upper))
+    lost = torch.full_like(state.lower, torch.inf)
+    return IntervalForm(
+        torch.where(kept[..., None], trial.lower, -lost), torch.where(kept[..., None], trial.upper, lost)
+    )
+
+
+def _widened(state: IntervalForm, after: IntervalForm) -> IntervalForm:
+    """A box around both, wider by a share of how far the flow goes."""
+    low, high = torch.minimum(state.lower, after.lower), torch.maximum(state.upper, after.upper)
+    more = _GROWTH * ((state.lower - low) + (high - state.upper)) + 1e-14 * (low.abs() + high.abs()) + TINY
+    return IntervalForm(round_down(low - more), round_up(high + more))
+
+
+def _slopes(programs: Expansion, inside: IntervalForm, control: IntervalForm | None) -> Tensor:
+    """``A >= |Df|``, ``(N, n, n)``."""
+    n = inside.lower.shape[-1]
+    unit = torch.eye(n, dtype=torch.float64)[:, None]  # directions are a batch in front of the parts
+    parts = [side.expand(n, *side.shape) for side in inside.bounds]
+    given = [unit.expand(n, len(inside.lower), n)] * 2
+    if control is not None:
+        given = [torch.cat([side.expand(n, *side.shape), e], -1) for side, e in zip(control.bounds, given, strict=True)]
+    nothing = torch.zeros(n, dtype=torch.float64)
+    (slope,) = _outputs(programs.tangent, IntervalForm(*parts), IntervalForm(nothing, nothing), IntervalForm(*given))
+    return torch.maximum(slope.lower.abs(), slope.upper.abs()).permute(1, 2, 0)
+
+
+def _drift(slopes: Tensor, radius: Tensor, h: float) -> Tensor:
+    """``e >= A (h^2/4 r_W + h e)``; infinite where none was found."""
+    more = 1 + 1e-9  # more than all that is rounded here
+    base = (h * h / 4 * more) * radius
+
+    def after(e: Tensor) -> Tensor:
+        return (slopes * (base + h * more * e)[..., None, :]).sum(-1) * more + TINY * (base.amax() > 0)
+
+    e = after(torch.zeros(slopes.shape[:-1], dtype=torch.float64))
+    kept = torch.zeros(slopes.shape[:-2], dtype=torch.bool)
+    for _ in range(_ROUNDS):
+        trial = 1.001 * e
+        e = after(trial)
+        kept = (e <= trial).all(-1)
+        if bool(kept.all()):
+            break
+    return torch.where(kept[..., None], trial, torch.inf)

@@ -1,0 +1,181 @@
+"""Reach sets of a sampled loop in continuous time.
+
+The remainder of every part of every period is guessed, the loop is propagated with it as one more disturbance, and what
+it has to contain is then computed on the sets that came out, for many periods at once. Where the guess holds all of it,
+induction over the parts makes the sets reach sets; else what was computed, widened, is the next guess.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.affine.affine import Affine, AffineRun
+from sagemp_cli.reachability.continuous.enclosure import enclosure
+from sagemp_cli.reachability.continuous.expansion import Expansion, expansion
+from sagemp_cli.reachability.continuous.sampled import SampledLoop
+from sagemp_cli.reachability.flow import Division, Flow
+from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.program.loops import RecordedLoop
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.zonotope import Zonotope
+
+_ATTEMPTS = 8
+"""Guesses of the remainders of a run of periods."""
+_FIRST, _LONGEST = 4, 32
+"""Periods that are propagated at a time, at first and at most."""
+
+
+@dataclass(frozen=True)
+class FlowRun:
+    """What was found.
+
+    Attributes:
+        run: of the step programs; its watched values are controls and then states within the period.
+        flow: between the instants.
+        failed: the first period of each cell in which no enclosure was found, K if there is none, ``(C,)``.
+    """
+
+    run: AffineRun
+    flow: Flow
+    failed: Tensor
+
+
+@dataclass(frozen=True)
+class _Block:
+    run: AffineRun
+    flow: Flow
+    holds: Tensor
+    needed: Tensor
+
+
+def _extrapolated(needed: Tensor) -> Tensor:
+    """A guess ``(2, 1, C, S, n)`` from what the last periods needed, ``(2, C, K, S, n)``."""
+    last = torch.nan_to_num(needed[:, :, -8:], nan=0.0, posinf=0.0, neginf=0.0)
+    low, high = last[0].amin(1), last[1].amax(1)
+    more = 0.2 * (high - low)
+    return torch.stack([low - more, high + more])[:, None]
+
+
+@torch.no_grad()
+def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: Division) -> FlowRun:
+    """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``.
+
+    Rows of the tube after a period in which no enclosure was found are infinite.
+    """
+    programs = expansion(loop, division)
+    cells, n, s = start.lower.shape[0], loop.state_dim, division.substeps
+    blocks: list[_Block] = []
+    states: Zonotope | None = None
+    guess = torch.zeros(2, 1, cells, s, n, dtype=torch.float64)
+    failed = torch.full((cells,), loop.horizon)
+    at, length, here = 0, _FIRST, start
+    while at < loop.horizon:
+        stop = min(at + length, loop.horizon)
+        part = RecordedLoop((programs.step,), loop.numbers[at:stop], stop - at)
+        block = _block(affine, part, programs, here, states, w, guess)
+        blocks.append(block)
+        bad = ~block.holds  # (periods, cells)
+        first = torch.where(bad.any(0), bad.to(torch.int8).argmax(0) + at, loop.horizon)
+        failed = torch.minimum(failed, first)
+        states = block.run.last
+        here = Box(*(_settled(side[:, -1]) for side in (block.run.tube.lower, block.run.tube.upper)))
+        guess = _extrapolated(block.needed)
+        at, length = stop, min(2 * length, _LONGEST)
+    run = _joined([b.run for b in blocks])
+    k = torch.arange(loop.horizon + 1)
+    lost = (k > failed[:, None])[..., None]
+    tube = Tube(torch.where(lost, -torch.inf, run.tube.lower), torch.where(lost, torch.inf, run.tube.upper))
+    between = Flow.join([b.flow for b in blocks], 1).known_until(failed)
+    return FlowRun(dataclasses.replace(run, tube=tube), between, failed)
+
+
+def _settled(side: Tensor) -> Tensor:
+    return torch.nan_to_num(side, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _block(
+    affine: Affine,
+    part: RecordedLoop,
+    programs: Expansion,
+    start: Box,
+    states: Zonotope | None,
+    w: Box,
+    guess: Tensor,
+) -> _Block:
+    """Some periods in a row, ``guess (2, 1 or K, C, S, n)`` of their remainders."""
+    cells, n = start.lower.shape
+    s, steps = programs.division.substeps, part.horizon
+    guess = guess.expand(2, steps, cells, s, n)
+    for _ in range(_ATTEMPTS):
+        sides = [
+            torch.cat([side.expand(steps, cells, s, n), g], -1).flatten(-2)
+            for side, g in zip((w.lower, w.upper), guess, strict=True)
+        ]
+        run = affine.run(part, start, Box(*sides), watch=True, states=states)
+        state, control = _boxes(run, n, s)
+        found = enclosure(programs, state, control, w)
+        shape = (cells, steps, s, n)
+        needed = torch.stack([found.remainder_lower, found.remainder_upper]).reshape(2, *shape)
+        given = guess.transpose(1, 2)
+        inside = ((given[0] <= needed[0]) & (needed[1] <= given[1])).all(-1).all(-1)  # (cells, steps)
+        bounded = torch.isfinite(run.tube.lower[:, :-1]).all(-1) & torch.isfinite(run.tube.upper[:, :-1]).all(-1)
+        if bool((inside | ~bounded).all()):
+            break
+        known = torch.isfinite(needed).all(0, keepdim=True)
+        width = 0.05 * (needed[1] - needed[0]) + 1e-18
+        wider = torch.stack([needed[0] - width, needed[1] + width])
+        guess = torch.where(known, wider, given).transpose(1, 2)
+    between = Flow(
+        programs.division,
+        *(side.reshape(shape) for side in state.bounds),
+        found.lower.reshape(shape),
+        found.upper.reshape(shape),
+        *given,
+        found.curve.reshape(shape),
+        found.drift.reshape(shape),
+    )
+    return _Block(run, between, inside.T, needed)
+
+
+def _boxes(run: AffineRun, n: int, s: int) -> tuple[IntervalForm, IntervalForm | None]:
+    """States at the beginning of every part and controls of it, ``(C K S, ...)``."""
+    lower, upper = run.tube.lower[:, :-1, None], run.tube.upper[:, :-1, None]
+    if run.watched_lower is None or run.watched_upper is None:
+        return IntervalForm(lower.reshape(-1, n), upper.reshape(-1, n)), None
+    states, controls = [], []
+    for side, watched in ((lower, run.watched_lower), (upper, run.watched_upper)):
+        m = watched.shape[-1] - (s - 1) * n
+        states.append(torch.cat([side, watched[..., m:].unflatten(-1, (s - 1, n))], 2) if s > 1 else side)
+        controls.append(watched[..., None, :m].expand(*watched.shape[:-1], s, m))
+    state = IntervalForm(*(side.reshape(-1, n) for side in states))
+    m = controls[0].shape[-1]
+    return state, IntervalForm(*(side.reshape(-1, m) for side in controls)) if m else None
+
+
+def _joined(runs: Sequence[AffineRun]) -> AffineRun:
+    """Runs over periods in a row, as one."""
+
+    def rows(side: str) -> Tensor:
+        tubes = [getattr(r.tube, side) for r in runs]
+        return torch.cat([tubes[0], *(t[:, 1:] for t in tubes[1:])], 1)
+
+    def watched(side: str) -> Tensor | None:
+        parts = [getattr(r, side) for r in runs]
+        return None if parts[0] is None else torch.cat(parts, 1)
+
+    return AffineRun(
+        Tube(rows("lower"), rows("upper")),
+        [band for r in runs for band in r.bands],
+        [mask for r in runs for mask in r.kept],
+        [],
+        watched("watched_lower"),
+        watched("watched_upper"),
+        tuple(dict.fromkeys(note for r in runs for note in r.notes)),
+        runs[-1].last,
+    )

@@ -1,0 +1,95 @@
+"""The tube of a sampled loop in continuous time: how a period is divided, and what is said where nothing was found."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import torch
+
+from sagemp_cli.errors import UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.propagation import FlowRun, propagated
+from sagemp_cli.reachability.continuous.sampled import Sampled, SampledLoop, sampled
+from sagemp_cli.reachability.flow import Division
+from sagemp_cli.reachability.propagator import Propagator, Reach
+from sagemp_cli.sets import Box
+
+ORDER = 2
+"""Degree of the Taylor polynomials where none is asked for."""
+MOST_SUBSTEPS = 32
+"""Parts of a period at most, where the number is not asked for."""
+
+
+def reach_continuously(
+    propagator: Propagator,
+    loop: Sampled | SampledLoop,
+    start: Box,
+    w: Box,
+    *,
+    substeps: int | None = None,
+    order: int | None = None,
+) -> Reach:
+    """Enclosures at the instants and between them, of every solution from ``start (C, n)`` under every measurable
+    signal in ``w (n,)``.
+
+    Args:
+        propagator: bounds the steps; ``affine``.
+        loop: an ODE and its control.
+        start, w: boxes.
+        substeps: parts of a period, a power of two; None begins with one and doubles while there is a period in which
+            no enclosure is found and more parts bring the first such period later.
+        order: degree of the Taylor polynomials, :data:`ORDER` by default.
+
+    Raises:
+        UsageError: boxes or numbers that do not fit.
+        UnsupportedOperationError: another propagator, or an operation that cannot be bounded or has no derivative.
+    """
+    if not isinstance(propagator, Affine):
+        raise UnsupportedOperationError(
+            f"propagator '{propagator.name}' bounds loops at their instants only; in continuous time take 'affine'"
+        )
+    known = sampled(loop, start)
+    n, order = known.state_dim, ORDER if order is None else order
+    if start.lower.dim() != 2 or start.dim != n or w.lower.shape != (n,):
+        raise UsageError(
+            f"the start boxes must be (C, {n}) and the disturbance ({n},), found {tuple(start.lower.shape)} and "
+            f"{tuple(w.lower.shape)}: in continuous time w is added to the rate of every state"
+        )
+    if not 0 < known.period < math.inf:
+        raise UsageError(f"the period must be a positive number of seconds, found {known.period}")
+    if substeps is not None and (substeps < 1 or substeps & (substeps - 1)):
+        raise UsageError(f"substeps must be a power of two, found {substeps}")
+    if order < 1:
+        raise UsageError(f"order must be at least 1, found {order}")
+    best: FlowRun | None = None
+    for parts in [substeps] if substeps else _doubling():
+        found = propagated(propagator, known, start, w, Division(parts, order))
+        later = best is None or int(found.failed.amin()) > int(best.failed.amin())
+        best = found if later else best
+        if not later or bool((found.failed >= known.horizon).all()):
+            break
+    assert best is not None
+    return _result(best, known, propagator)
+
+
+def _doubling() -> Iterator[int]:
+    return itertools.takewhile(lambda parts: parts <= MOST_SUBSTEPS, (2**i for i in itertools.count()))
+
+
+def _result(found: FlowRun, loop: SampledLoop, affine: Affine) -> Reach:
+    run, m, parts = found.run, loop.controls, found.flow.division.substeps
+    notes, first = list(run.notes), int(found.failed.amin())
+    if first < loop.horizon:
+        notes.append(
+            f"period {first}: no box was found that the flow stays in within 1/{parts} of {loop.period:g} s; the tube "
+            f"ends there"
+        )
+    recording = run.recording() if run.alike else None
+    if run.watched_lower is None or run.watched_upper is None:
+        return Reach(run.tube, recording=recording, notes=tuple(notes), flow=found.flow)
+    lower, upper = run.watched_lower[..., :m], run.watched_upper[..., :m]
+    bad = torch.isnan(lower) | torch.isnan(upper)
+    lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
+    return Reach(run.tube, lower, upper, recording, tuple(notes), found.flow)
