@@ -57,6 +57,10 @@ class Flow:
         sides = zip(signs, self._sides(), strict=True)
         return Flow(self.division, *(torch.where(lost, sign * torch.inf, side) for sign, side in sides))
 
+    def padded(self, periods: int) -> Flow:
+        """The same with so many periods more, of which nothing is said yet."""
+        return Flow(self.division, *(torch.nn.functional.pad(s, (0, 0, 0, 0, 0, periods)) for s in self._sides()))
+
     @staticmethod
     def join(parts: Sequence[Flow], dim: int = 0) -> Flow:
         """One after the other, of cells (0) or of periods (1)."""

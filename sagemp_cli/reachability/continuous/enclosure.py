@@ -144,7 +144,7 @@ def _drift(slopes: Tensor, radius: Tensor, h: float) -> Tensor:
         return (slopes * (base + h * more * e)[..., None, :]).sum(-1) * more + TINY * (base.amax() > 0)
 
     e = after(torch.zeros(slopes.shape[:-1], dtype=torch.float64))
-    kept = torch.zeros(slopes.shape[:-2], dtype=torch.bool)
+    trial, kept = e, torch.zeros(slopes.shape[:-2], dtype=torch.bool)
     for _ in range(_ROUNDS):
         trial = 1.001 * e
         e = after(trial)

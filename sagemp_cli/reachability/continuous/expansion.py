@@ -1,11 +1,11 @@
-"""One period of a sampled loop as a step program: Taylor polynomials of the flow, and what they leave out as a disturbance.
+"""One period of a sampled loop as a step program: Taylor polynomials of the flow, their remainders a disturbance.
 
 With the control u held, h the length of one of S equal parts of the period and ``w_j`` the mean of w over part j, ::
 
     x_{j+1} = x_j + h c_1 + h^2 c_2 + ... + h^p c_p + r_j
 
 where ``c_1 = f(x_j, u) + w_j, c_2, ...`` are the Taylor coefficients of ``y' = f(y, u) + w_j`` from x_j on. Bounds of
-``r_j`` are found in :mod:`~sagemp_cli.reachability.continuous.enclosure`, and ``docs/continuous_time.md`` has the proof.
+``r_j`` are found in :mod:`~sagemp_cli.reachability.continuous.enclosure`; ``docs/continuous_time.md`` has the proof.
 The step's disturbance is ``(w_1, r_1, ..., w_S, r_S)``; its output ``control`` is u and then ``x_1, ..., x_{S-1}``.
 """
 
@@ -77,16 +77,13 @@ def expansion(loop: SampledLoop, division: Division) -> Expansion:
     for j in range(s):
         w, r = (out.pick(out.disturbance, 2 * n * j + n * i, n) for i in range(2))
         c = state_coefficients(out, loop.rate, x, u, w, division.order)
-        total = None
+        total: int | None = None
         for coefficient in c[:0:-1]:  # Horner's rule
+            total = None if total is None else out.scaled(total, h)
             total = (
-                coefficient
-                if total is None
-                else out.scaled(total, h)
-                if coefficient is None
-                else out.of("add", coefficient, out.scaled(total, h))
+                total if coefficient is None else coefficient if total is None else out.of("add", coefficient, total)
             )
-        x = out.of("add", x, out.of("add", out.scaled(total, h), r))
+        x = out.of("add", x, r if total is None else out.of("add", out.scaled(total, h), r))
         between.append(x)
     watched = [*([] if u is None else [u]), *between[:-1]]
     step = out.finished(next=x, control=out.join(*watched) if watched else None)

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,12 +22,17 @@ from sagemp_cli.reachability.flow import Division, Flow
 from sagemp_cli.reachability.interval.form import IntervalForm
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.rounding import TINY
 from sagemp_cli.sets.zonotope import Zonotope
 
 _ATTEMPTS = 8
 """Guesses of the remainders of a run of periods."""
 _FIRST, _LONGEST = 4, 32
 """Periods that are propagated at a time, at first and at most."""
+_MARGIN = 0.05
+"""Share of its width that a guess is wider than what it was made from."""
+_SEEN = 8
+"""Periods that a guess for the next ones looks back on."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +52,51 @@ class FlowRun:
 
 @dataclass(frozen=True)
 class _Block:
+    """Some periods in a row.
+
+    Attributes:
+        run: with guessed remainders.
+        flow: with these.
+        needed: what they have to contain, ``(2, C, K, S, n)``.
+    """
+
     run: AffineRun
     flow: Flow
-    holds: Tensor
     needed: Tensor
 
+    @property
+    def holds(self) -> Tensor:
+        """Whether they do, ``(C, K)``."""
+        low, high = self.needed
+        inside = (self.flow.remainder_lower <= low) & (high <= self.flow.remainder_upper)
+        return inside.flatten(2).all(-1)
 
-def _extrapolated(needed: Tensor) -> Tensor:
-    """A guess ``(2, 1, C, S, n)`` from what the last periods needed, ``(2, C, K, S, n)``."""
-    last = torch.nan_to_num(needed[:, :, -8:], nan=0.0, posinf=0.0, neginf=0.0)
-    low, high = last[0].amin(1), last[1].amax(1)
-    more = 0.2 * (high - low)
-    return torch.stack([low - more, high + more])[:, None]
+    @property
+    def settled(self) -> Tensor:
+        """Whether another guess is of no use, ``(C, K)``."""
+        tube = self.run.tube
+        bounded = torch.isfinite(tube.lower[:, :-1]).all(-1) & torch.isfinite(tube.upper[:, :-1]).all(-1)
+        return self.holds | ~bounded
+
+    def widened(self) -> Tensor:
+        """The next guess, ``(2, K, C, S, n)``."""
+        low, high = self.needed
+        more = _MARGIN * (high - low) + TINY
+        known = torch.isfinite(self.needed).all(0)
+        guess = torch.stack(
+            [
+                torch.where(known, low - more, self.flow.remainder_lower),
+                torch.where(known, high + more, self.flow.remainder_upper),
+            ]
+        )
+        return guess.transpose(1, 2)
+
+    def extrapolated(self) -> Tensor:
+        """A guess for the periods that follow, ``(2, 1, C, S, n)``."""
+        last = torch.nan_to_num(self.needed[:, :, -_SEEN:], nan=0.0, posinf=0.0, neginf=0.0)
+        low, high = last[0].amin(1), last[1].amax(1)
+        more = 2 * _MARGIN * (high - low) + TINY
+        return torch.stack([low - more, high + more])[:, None]
 
 
 @torch.no_grad()
@@ -80,19 +117,19 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
         part = RecordedLoop((programs.step,), loop.numbers[at:stop], stop - at)
         block = _block(affine, part, programs, here, states, w, guess)
         blocks.append(block)
-        bad = ~block.holds  # (periods, cells)
-        first = torch.where(bad.any(0), bad.to(torch.int8).argmax(0) + at, loop.horizon)
+        bad = ~block.holds
+        first = torch.where(bad.any(1), bad.to(torch.int8).argmax(1) + at, loop.horizon)
         failed = torch.minimum(failed, first)
         states = block.run.last
         here = Box(*(_settled(side[:, -1]) for side in (block.run.tube.lower, block.run.tube.upper)))
-        guess = _extrapolated(block.needed)
+        guess = block.extrapolated()
         at, length = stop, min(2 * length, _LONGEST)
-    run = _joined([b.run for b in blocks])
-    k = torch.arange(loop.horizon + 1)
-    lost = (k > failed[:, None])[..., None]
-    tube = Tube(torch.where(lost, -torch.inf, run.tube.lower), torch.where(lost, torch.inf, run.tube.upper))
-    between = Flow.join([b.flow for b in blocks], 1).known_until(failed)
-    return FlowRun(dataclasses.replace(run, tube=tube), between, failed)
+    run, rest = _joined([b.run for b in blocks]), loop.horizon - at
+    between = Flow.join([b.flow for b in blocks], 1).padded(rest).known_until(failed)
+    tube = Tube(*(torch.nn.functional.pad(side, (0, 0, 0, rest)) for side in (run.tube.lower, run.tube.upper)))
+    lost = (torch.arange(loop.horizon + 1) > failed[:, None])[..., None]
+    tube = Tube(torch.where(lost, -torch.inf, tube.lower), torch.where(lost, torch.inf, tube.upper))
+    return FlowRun(dataclasses.replace(run, tube=tube, bands=[] if rest else run.bands), between, failed)
 
 
 def _settled(side: Tensor) -> Tensor:
@@ -108,39 +145,46 @@ def _block(
     w: Box,
     guess: Tensor,
 ) -> _Block:
-    """Some periods in a row, ``guess (2, 1 or K, C, S, n)`` of their remainders."""
+    """Some periods in a row, beginning with ``guess (2, 1 or K, C, S, n)`` of their remainders."""
+    for _ in range(_ATTEMPTS - 1):
+        block = _attempt(affine, part, programs, start, states, w, guess)
+        if bool(block.settled.all()):
+            return block
+        guess = block.widened()
+    return _attempt(affine, part, programs, start, states, w, guess)
+
+
+def _attempt(
+    affine: Affine, part: RecordedLoop, programs: Expansion, start: Box, states: Zonotope | None, w: Box, guess: Tensor
+) -> _Block:
+    """The same with one guess."""
     cells, n = start.lower.shape
     s, steps = programs.division.substeps, part.horizon
     guess = guess.expand(2, steps, cells, s, n)
-    for _ in range(_ATTEMPTS):
-        sides = [
-            torch.cat([side.expand(steps, cells, s, n), g], -1).flatten(-2)
-            for side, g in zip((w.lower, w.upper), guess, strict=True)
-        ]
-        run = affine.run(part, start, Box(*sides), watch=True, states=states)
-        state, control = _boxes(run, n, s)
-        found = enclosure(programs, state, control, w)
-        shape = (cells, steps, s, n)
-        needed = torch.stack([found.remainder_lower, found.remainder_upper]).reshape(2, *shape)
-        given = guess.transpose(1, 2)
-        inside = ((given[0] <= needed[0]) & (needed[1] <= given[1])).all(-1).all(-1)  # (cells, steps)
-        bounded = torch.isfinite(run.tube.lower[:, :-1]).all(-1) & torch.isfinite(run.tube.upper[:, :-1]).all(-1)
-        if bool((inside | ~bounded).all()):
-            break
-        known = torch.isfinite(needed).all(0, keepdim=True)
-        width = 0.05 * (needed[1] - needed[0]) + 1e-18
-        wider = torch.stack([needed[0] - width, needed[1] + width])
-        guess = torch.where(known, wider, given).transpose(1, 2)
+    sides = [
+        torch.cat([side.expand(steps, cells, s, n), g], -1).flatten(-2)
+        for side, g in zip((w.lower, w.upper), guess, strict=True)
+    ]
+    run = affine.run(part, start, Box(*sides), watch=True, states=states)
+    state, control = _boxes(run, n, s)
+    found = enclosure(programs, state, control, w)
+
+    def shaped(side: Tensor) -> Tensor:
+        return side.reshape(cells, steps, s, n)
+
+    given = guess.transpose(1, 2)
     between = Flow(
         programs.division,
-        *(side.reshape(shape) for side in state.bounds),
-        found.lower.reshape(shape),
-        found.upper.reshape(shape),
-        *given,
-        found.curve.reshape(shape),
-        found.drift.reshape(shape),
+        shaped(state.lower),
+        shaped(state.upper),
+        shaped(found.lower),
+        shaped(found.upper),
+        given[0],
+        given[1],
+        shaped(found.curve),
+        shaped(found.drift),
     )
-    return _Block(run, between, inside.T, needed)
+    return _Block(run, between, torch.stack([shaped(found.remainder_lower), shaped(found.remainder_upper)]))
 
 
 def _boxes(run: AffineRun, n: int, s: int) -> tuple[IntervalForm, IntervalForm | None]:

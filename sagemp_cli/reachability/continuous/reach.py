@@ -21,6 +21,9 @@ ORDER = 2
 MOST_SUBSTEPS = 32
 """Parts of a period at most, where the number is not asked for."""
 
+_PROGRESS = 0.8
+"""Share of the periods without enclosure that may be left by twice as many parts, for it to go on."""
+
 
 def reach_continuously(
     propagator: Propagator,
@@ -39,7 +42,7 @@ def reach_continuously(
         loop: an ODE and its control.
         start, w: boxes.
         substeps: parts of a period, a power of two; None begins with one and doubles while there is a period in which
-            no enclosure is found and more parts bring the first such period later.
+            no enclosure is found and more parts leave fewer of them.
         order: degree of the Taylor polynomials, :data:`ORDER` by default.
 
     Raises:
@@ -66,12 +69,17 @@ def reach_continuously(
     best: FlowRun | None = None
     for parts in [substeps] if substeps else _doubling():
         found = propagated(propagator, known, start, w, Division(parts, order))
-        later = best is None or int(found.failed.amin()) > int(best.failed.amin())
-        best = found if later else best
-        if not later or bool((found.failed >= known.horizon).all()):
+        left, before = _missing(found), math.inf if best is None else _missing(best)
+        best = found if left < before else best
+        if left == 0 or known.horizon - left > 0 and left > _PROGRESS * before:
             break
     assert best is not None
     return _result(best, known, propagator)
+
+
+def _missing(found: FlowRun) -> int:
+    """Periods that the worst cell has no enclosure of."""
+    return found.flow.lower.shape[1] - int(found.failed.amin())
 
 
 def _doubling() -> Iterator[int]:
@@ -86,6 +94,9 @@ def _result(found: FlowRun, loop: SampledLoop, affine: Affine) -> Reach:
             f"period {first}: no box was found that the flow stays in within 1/{parts} of {loop.period:g} s; the tube "
             f"ends there"
         )
+    if first < loop.horizon and not run.bands:  # it was given up before the last period
+        nothing = torch.full((*run.tube.lower.shape[:-2], loop.horizon, m), torch.inf, dtype=torch.float64)
+        return Reach(run.tube, -nothing, nothing, None, tuple(notes), found.flow)
     recording = run.recording() if run.alike else None
     if run.watched_lower is None or run.watched_upper is None:
         return Reach(run.tube, recording=recording, notes=tuple(notes), flow=found.flow)
