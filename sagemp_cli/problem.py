@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.scenes.scene import Scene
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class Problem:
         start: X_I, ``(n,)``; ``(R, n)`` where each of R references has its own.
         disturbance: W, ``(d,)``.
         horizon: number of steps K.
+        between: whether the safe set is to be kept over the whole of every step. It is for every robot here; a
+            stranger's loop may be no motion along straight lines.
     """
 
     dynamics: Dynamics
@@ -26,3 +28,4 @@ class Problem:
     start: Box
     disturbance: Box
     horizon: int
+    between: Between = Between.SEGMENTS

@@ -246,9 +246,10 @@ def _geometry(
                 raise Unproved("its cells do not cover X_I")
             if not (np.isfinite(lower) & np.isfinite(upper) & (lower <= upper)).all():
                 raise Unproved("its tube is not finite")
-            if tubes["step"][r] != -1 or tubes["constraint"][r] != "":
+            if tubes["step"][r] != -1 or tubes["fraction"][r] != 0 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
-            distances = clearances(safe, *(np.concatenate(side[..., index]) for side in (lower, upper)))
+            places = (side[..., index] for side in (lower, upper))
+            distances = clearances(safe, *places, between=document.between, parts=document.parts)
             for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
                 if not distance > 0:
                     raise Unproved(f"its tube is not clear of '{name}'")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sagemp_cli.checker.between import SAMPLES
 from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.equations import Names, equations, matrix_of
 from sagemp_cli.checker.program import Program
@@ -34,7 +35,8 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     names, units = document.state_names, document.state_units
     w_names = disturbance_names(document)
     rows = [
-        ("for", f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {document.horizon} steps, at the samples"),
+        ("for", f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {document.horizon} steps"),
+        ("between", _between(document)),
         ("X_I", _box(*sets[0].corners(), names, units)),
         ("W", _box(*sets[1].corners(), w_names, [""] * len(w_names))),
         *[("w enters", text) for text in [_entrance(document)] if text],
@@ -60,6 +62,16 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
         if len(tubes["references"]) > _MOST_REFERENCES:
             rows.append(("references", f"{len(tubes['references']) - _MOST_REFERENCES} more"))
     return rows
+
+
+def _between(document: Document) -> str:
+    """What is claimed of the time between two samples."""
+    if document.between == SAMPLES:
+        return "samples: the safe set is kept at the samples; of the time between them NOTHING is claimed"
+    return (
+        f"segments: the safe set is kept over the whole of every step, on the straight line from x_k to x_k+1 "
+        f"({document.parts} parts a step); the goal at step K"
+    )
 
 
 def said_rows(document: Document) -> list[tuple[str, str]]:

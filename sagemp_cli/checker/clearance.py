@@ -7,14 +7,39 @@ from typing import Any
 import numpy as np
 
 from sagemp_cli.checker.balls import arb, ball
+from sagemp_cli.checker.between import SAMPLES, Sides, parts_of_step, samples_of, whole_step
 from sagemp_cli.checker.scene import Corners, SafeSet
 
 
-def clearances(safe: SafeSet, lower: np.ndarray, upper: np.ndarray) -> list[arb]:
-    """Of position boxes ``(rows, d)``: the least distance to each constraint (to a block: the largest gap)."""
-    boxes = list(zip(lower, upper, strict=True))
-    found = [] if safe.workspace is None else [smallest([_inside(low, high, safe.workspace) for low, high in boxes])]
-    return found + [smallest([_apart(low, high, o) for low, high in boxes]) for o in safe.obstacles]
+def clearances(safe: SafeSet, lower: np.ndarray, upper: np.ndarray, *, between: str, parts: int) -> list[arb]:
+    """Of tubes over the position ``(C, K+1, d)``: the least distance to each constraint (to a block: the largest gap).
+
+    Over the whole of every step, in so many parts, unless the samples only are asked for.
+    """
+    tubes = [samples_of(low, high) for low, high in zip(lower, upper, strict=True)]
+    distances = [] if safe.workspace is None else [lambda box: _inside(box, safe.workspace)]
+    distances += [lambda box, o=o: _apart(box, o) for o in safe.obstacles]
+    if between == SAMPLES:
+        return [smallest([distance(box) for tube in tubes for box in tube]) for distance in distances]
+    steps = [pair for tube in tubes for pair in zip(tube[:-1], tube[1:], strict=True)]
+    return [_least(steps, distance, parts) for distance in distances]
+
+
+def _least(steps: list[tuple[Sides, Sides]], distance: Any, parts: int) -> arb:
+    """The least distance over the parts of all steps.
+
+    One box over a whole step is no farther away than its parts are: a step for which that is not below what is found
+    already cannot change the least, and the nearest steps come first.
+    """
+    known = sorted(((distance(whole_step(*step)), step) for step in steps), key=lambda pair: float(pair[0].mid()))
+    found: arb | None = None
+    for whole, step in known:
+        if found is not None and whole >= found:
+            continue
+        nearest = smallest([distance(box) for box in parts_of_step(*step, parts)])
+        found = nearest if found is None else found.min(nearest)
+    assert found is not None
+    return found
 
 
 def goal_margins(safe: SafeSet, lower: np.ndarray, upper: np.ndarray) -> list[arb | None]:
@@ -37,21 +62,19 @@ def smallest(values: list[arb]) -> arb:
     return out
 
 
-def _inside(lower: np.ndarray, upper: np.ndarray, box: Corners) -> arb:
-    low, high = box
-    sides = [ball(a) - ball(c) for a, c in zip(lower, low, strict=True) if c != -np.inf]
-    sides += [ball(c) - ball(b) for b, c in zip(upper, high, strict=True) if c != np.inf]
+def _inside(box: Sides, workspace: Corners) -> arb:
+    low, high = workspace
+    sides = [a - ball(c) for a, c in zip(box[0], low, strict=True) if c != -np.inf]
+    sides += [ball(c) - b for b, c in zip(box[1], high, strict=True) if c != np.inf]
     return smallest(sides) if sides else arb("inf")
 
 
-def _apart(lower: np.ndarray, upper: np.ndarray, obstacle: tuple[str, str, list[float], Any]) -> arb:
+def _apart(box: Sides, obstacle: tuple[str, str, list[float], Any]) -> arb:
     _, kind, first, second = obstacle
     if kind == "block":
-        gaps = [
-            (ball(c) - ball(b)).max(ball(a) - ball(d)) for a, b, c, d in zip(lower, upper, first, second, strict=True)
-        ]
+        gaps = [(ball(c) - b).max(a - ball(d)) for a, b, c, d in zip(*box, first, second, strict=True)]
         return -smallest([-g for g in gaps])
     total = arb(0)
-    for a, b, c in zip(lower, upper, first, strict=True):
-        total += (ball(a) - ball(c)).max(ball(c) - ball(b)).max(arb(0)) ** 2
+    for a, b, c in zip(*box, first, strict=True):
+        total += (a - ball(c)).max(ball(c) - b).max(arb(0)) ** 2
     return total.sqrt() - ball(second)

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.checker.balls import arb, balls, ctx
+from sagemp_cli.checker.balls import arb, ball, balls, ctx
+from sagemp_cli.checker.between import SEGMENTS, on_line
 from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.points import Point, outputs_at
 from sagemp_cli.checker.program import Program
@@ -43,6 +44,8 @@ def replay(
 def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[Ends, Ends], safe: SafeSet) -> str:
     """Prove that a rollout from X_I under disturbances in W leaves the safe set or misses the goal.
 
+    It does so at its step, or at the fraction of it that the record says, on the straight line to the next sample.
+
     The start and the disturbances are taken from the record as exact numbers, nothing else is. The boxes stored beside
     the tubes may be larger than X_I and W: from there everything is moved into the nearest point of those.
 
@@ -56,6 +59,7 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
         Nothing, or in one line what could not be proved.
     """
     r, step, states, disturbances = (example[key] for key in ("reference", "step", "states", "disturbances"))
+    step, fraction = int(step), float(example["fraction"])
     tubes, last = document.tubes, document.horizon
     try:
         first = states[0]
@@ -66,13 +70,17 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
             raise Unproved("its disturbances are not in W")
         if not 0 <= step <= last:
             raise Unproved(f"its step {step} is none of the horizon {last}")
+        if not (fraction == 0 or (0 < fraction < 1 and step < last and document.between == SEGMENTS)):
+            raise Unproved(f"its time, {fraction:.6g} of step {step} over, is none that the claim speaks of")
         with ctx.workprec(BITS):
             programs = [document.programs[i] for i in document.step_program]
-            x0, w = _moved(first, sets[0]), [_moved(row, sets[1]) for row in disturbances[: int(step)]]
-            x = replay(programs, x0, w, document.windows(r))[-1]
-            if _violates(x, document.position, safe, at_end=int(step) == last):
+            rows = disturbances[: step + (fraction > 0)]
+            x0, w = _moved(first, sets[0]), [_moved(row, sets[1]) for row in rows]
+            x = replay(programs, x0, w, document.windows(r))
+            now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
+            if _violates(now, document.position, safe, at_end=step == last):
                 return ""
-            raise Unproved(f"its replay violates nothing for certain at step {int(step)}")
+            raise Unproved(f"its replay violates nothing for certain at step {step + fraction:.10g}")
     except (Unproved, ArithmeticError) as e:
         return str(e)
 
@@ -116,4 +124,5 @@ def applies(example: Mapping[str, Any], document: Document) -> bool:
         and isinstance(reference, int | np.integer)
         and 0 <= reference < len(tubes["verdict"])
         and isinstance(example.get("step"), int | np.integer)
+        and isinstance(example.get("fraction"), float | np.floating)
     )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sagemp_cli.checker.between import MOST_PARTS, SAMPLES, SEGMENTS
 from sagemp_cli.checker.program import Instruction, Program
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.checker.unproved import Unproved
@@ -20,7 +21,7 @@ from sagemp_cli.reading.reader import read_tree
 from sagemp_cli.reading.tree import Dataset, Group
 from sagemp_cli.storage.content import ContentError, content_hash
 
-KINDS = {"sagemp/certificate": 2, "sagemp/library": 2}
+KINDS = {"sagemp/certificate": 3, "sagemp/library": 3}
 """Schemas that can be checked, with the version of their format."""
 _COMMANDS = {"sagemp/certificate": "verify", "sagemp/library": "build-library"}
 
@@ -33,6 +34,8 @@ class Document:
         kind: ``certificate`` or ``library``.
         config: the resolved config.
         said: what the file says of itself beside its claim: experiment, stage, version, propagator and the like.
+        between: ``segments`` if the safe set is claimed to be kept over the whole of every step, or ``samples``.
+        parts: of a step, which are checked one by one.
         tubes: datasets of ``/data/tubes`` by name, texts as lists of str; ``references`` is None if there are none.
         relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``; empty if none are recorded.
         programs: the step, one program or several.
@@ -52,6 +55,8 @@ class Document:
     kind: str
     config: Mapping[str, Any]
     said: Mapping[str, Any]
+    between: str
+    parts: int
     tubes: Mapping[str, Any]
     relaxations: dict[str, np.ndarray]
     programs: tuple[Program, ...]
@@ -122,7 +127,7 @@ def _read(file: Group, path: Path) -> Document:
         )
     if version < KINDS[schema]:
         raise ArtifactError(
-            f"{path}: format {version} of '{schema}' does not carry its step as a program; "
+            f"{path}: format {version} of '{schema}' is an old one, which does not say what holds between the samples; "
             f"make it again with 'sagemp {_COMMANDS[schema]} --overwrite'"
         )
     stored = str(file.attrs.get("content_sha256", ""))
@@ -160,6 +165,8 @@ def _read(file: Group, path: Path) -> Document:
         return document
     true = _tubes(data.group("true_model/tubes"), path)
     true.pop("said")
+    if (true["between"], true["parts"]) != (document.between, document.parts):
+        raise ArtifactError(f"{path}: /data/true_model is about other times than the robot's own claim")
     program = _program(data.group("true_model/program"), n, d, document.lookahead * n)
     deviation = _dataset(data.dataset("true_model/deviation"))
     true = dataclasses.replace(
@@ -300,7 +307,14 @@ def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
         recorded = tubes.group("relaxations")
         _require_known(recorded, "slope", "offset", "radius", "kept")
         relaxations = {name: _dataset(recorded.dataset(name)) for name in recorded}
+    between, parts = str(tubes.attrs["between"]), int(tubes.attrs["parts"])
+    if between not in (SEGMENTS, SAMPLES):
+        raise ValueError(f"{tubes.name}: between is '{between[:40]}'; known are {SEGMENTS} and {SAMPLES}")
+    if not 1 <= parts <= MOST_PARTS or (between == SAMPLES and parts != 1):
+        raise ValueError(f"{tubes.name}: a step is checked in {parts} parts; 1 to {MOST_PARTS} can be")
     return {
+        "between": between,
+        "parts": parts,
         "tubes": read,
         "said": {name: _plain(tubes.attrs[name]) for name in ("propagator", "rigorous")},
         "relaxations": relaxations,
@@ -332,6 +346,7 @@ _SHAPES = {
     "clearance": "R constraints",
     "goal_margin": "R n",
     "step": "R",
+    "fraction": "R",
     "seconds": "R",
 }
 _TEXTS = {"verdict": "R", "constraint": "R", "constraint_names": "constraints"}

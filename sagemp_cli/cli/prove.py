@@ -58,6 +58,14 @@ def prove(
             metavar="STATES", help="The states that the scene is about; its first ones by default.", show_default=False
         ),
     ] = None,
+    between: Annotated[
+        str,
+        typer.Option(
+            metavar="WHEN",
+            help="When the scene is to be kept: segments, on the straight lines between the samples too (what a "
+            "forward-Euler step moves along), or samples, of a step that is no such motion.",
+        ),
+    ] = "segments",
     names: Annotated[str | None, typer.Option(metavar="WORDS", help="Of the states.", show_default=False)] = None,
     units: Annotated[str | None, typer.Option(metavar="WORDS", help="Of the states.", show_default=False)] = None,
     dt: Annotated[
@@ -103,6 +111,7 @@ def prove(
             scene=None if scene is None else mapping_in(scene, f"scene file {scene}"),
             goal=None if goal is None else _box("--goal", goal, open_ends=True),
             position=None if position is None else _words(position),
+            between=between,
             state_names=None if names is None else _words(names),
             state_units=None if units is None else _words(units),
             dt=dt,
@@ -128,6 +137,8 @@ def as_data(proof: LoopProof) -> dict[str, Any]:
         "verdict": str(proof.answer),
         "exit_code": ANSWER_CODES[str(proof.answer)],
         "why": str(verdict),
+        "between": str(v.between),
+        "holds": v.between.words,
         "horizon": proof.loop.horizon,
         "cells": len(v.cells.lower),
         "propagator": v.propagator,
@@ -142,7 +153,12 @@ def as_data(proof: LoopProof) -> dict[str, Any]:
         ],
         "counterexample": None
         if example is None
-        else {"step": example.step, "depth": example.depth, "start": example.start.tolist()},
+        else {
+            "step": example.step,
+            "fraction": example.fraction,
+            "depth": example.depth,
+            "start": example.start.tolist(),
+        },
         "unproved_violation": None if proof.unproved is None else proof.unproved.depth,
         "asks": claim.asks,
         "notes": list(v.notes),
@@ -157,8 +173,12 @@ def as_lines(data: dict[str, Any]) -> list[str]:
     lines = [f"{data['verdict']}: {data['why']} (K = {data['horizon']}, {cells}, {data['propagator']}{rounding})"]
     if not data["asks"]:
         lines.append("  no scene and no goal were given: what is proved is the tube")
+    if data["clearance"] and data["between"] == "samples":
+        lines.append("  between the samples nothing is claimed: --between segments claims it of straight lines")
     if data["verdict"] == "VERIFIED":
-        lines += [f"  keeps {d:.3g} from {name}" for name, d in data["clearance"].items() if d is not None]
+        lines += [
+            f"  keeps {d:.3g} from {name} {data['holds']}" for name, d in data["clearance"].items() if d is not None
+        ]
     ends = ", ".join(f"{s['state']} {s['lower']:.4g} to {s['upper']:.4g}" for s in data["at_the_end"])
     lines.append(f"  at step {data['horizon']}: {ends}")
     if data["counterexample"] is not None:

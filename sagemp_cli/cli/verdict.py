@@ -26,6 +26,10 @@ def read_certificate(path: Path) -> Artifact[Certificate]:
         raise ArtifactError(
             f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(ANSWER_CODES)}"
         )
+    if artifact.record.tubes.between not in ("segments", "samples"):
+        raise ArtifactError(
+            f"{path}: /data/tubes/between is '{artifact.record.tubes.between}'; known: segments, samples"
+        )
     return artifact
 
 
@@ -56,16 +60,16 @@ def exit_code(certificate: Artifact[Certificate]) -> int:
 def as_lines(certificate: Artifact[Certificate]) -> list[str]:
     """The verdict and what decided it, where the files are."""
     data = as_json(certificate)
-    what = f"experiment {data['experiment']}, K = {data['horizon']}, at the samples, {data['propagator']}"
+    what = f"experiment {data['experiment']}, K = {data['horizon']}, {data['propagator']}"
     cells = f"{data['cells']} cell{'s' * (data['cells'] != 1)}"
     counted = f"{data['certified']} of {len(data['references'])} references certified, {cells}"
     lines = [f"{data['verdict']}: {counted} ({what}{'' if data['rigorous'] else ', rounding not included'})"]
     for i, item in enumerate(data["references"]):
         if item["verdict"] == "SAFE":
             near = f", keeps {item['clearance']:.3g} m from {item['nearest']}" if item["nearest"] else ""
-            lines.append(f"  reference {i}: SAFE at the samples{near}")
+            lines.append(f"  reference {i}: SAFE {data['holds']}{near}")
         else:
-            lines.append(f"  reference {i}: {item['verdict']} at step {item['step']} ({item['constraint']})")
+            lines.append(f"  reference {i}: {item['verdict']} at {item['time']} ({item['constraint']})")
     if data["stand_in"]:
         lines.append(f"  plans: of a {data['stand_in']}")
     if data["learned"] is not None:
@@ -77,7 +81,7 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
         if not c["within"]
     ]
     lines += [
-        f"  counterexample: reference {c['reference']}, {c['kind']} at step {c['step']} ({c['constraint']}),"
+        f"  counterexample: reference {c['reference']}, {c['kind']} at {c['time']} ({c['constraint']}),"
         f" {c['depth']:.3g} deep"
         for c in data["counterexamples"]
     ]
@@ -113,8 +117,10 @@ def _learned_lines(learned: dict[str, Any]) -> list[str]:
 def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
     """The same as plain data."""
     from sagemp_cli.pipeline.models import stand_in
+    from sagemp_cli.sets.between import Between, moment
 
     record, tubes = certificate.record, certificate.record.tubes
+    dt = record.loop.dt
     figure = certificate.path.with_suffix(".png")
     references = []
     for i, verdict in enumerate(tubes.verdict):
@@ -124,6 +130,8 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
             {
                 "verdict": verdict,
                 "step": None if tubes.step[i] < 0 else int(tubes.step[i]),
+                "fraction": None if tubes.step[i] < 0 else float(tubes.fraction[i]),
+                "time": None if tubes.step[i] < 0 else moment(int(tubes.step[i]), float(tubes.fraction[i]), dt),
                 "constraint": tubes.constraint[i],
                 "clearance": None if nearest is None else float(clearance[nearest]),
                 "nearest": None if nearest is None else tubes.constraint_names[nearest],
@@ -134,7 +142,8 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "exit_code": exit_code(certificate),
         "experiment": certificate.header.experiment,
         "stand_in": stand_in(certificate.header.config) or None,
-        "holds": "at the samples",
+        "between": tubes.between,
+        "holds": Between(tubes.between).words,
         "horizon": int(tubes.tube_lower.shape[1] - 1),
         "propagator": tubes.propagator,
         "rigorous": tubes.rigorous,
@@ -145,7 +154,15 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "controls": _controls(certificate),
         "learned": _learned(certificate),
         "counterexamples": [
-            {"reference": c.reference, "kind": c.kind, "step": c.step, "constraint": c.constraint, "depth": c.depth}
+            {
+                "reference": c.reference,
+                "kind": c.kind,
+                "step": c.step,
+                "fraction": c.fraction,
+                "time": moment(c.step, c.fraction, dt),
+                "constraint": c.constraint,
+                "depth": c.depth,
+            }
             for c in record.counterexamples
         ],
         "falsifier_rollouts": record.falsifier_rollouts,

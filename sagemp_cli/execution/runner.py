@@ -34,7 +34,7 @@ class Execution:
         query: query of each rollout, ``(rollouts,)``.
         states, controls, disturbances: ``(rollouts, K+1, n)``, ``(rollouts, K, m)``, ``(rollouts, K, n)``.
         in_tube: whether the rollout stayed in its certified tube, ``(rollouts,)``.
-        safe: whether it kept clear at every step and ended in the goal, ``(rollouts,)``.
+        safe: whether it kept clear over the whole of every step and ended in the goal, ``(rollouts,)``.
     """
 
     sampled: Tensor
@@ -105,7 +105,7 @@ def execute_queries(
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)
             cells, tubes = library.cells_of(i)
-            clear = (problem.scene.signed_distance(states[..., list(problem.dynamics.position)]) > 0).all(-1)
+            clear = (problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]) > 0).all(-1)
             safe = clear & problem.scene.goal.contains(states[:, -1])
             parts.append((torch.full((rollouts,), q), states, controls, w, inside_tube(states, cells, tubes), safe))
             task.advance()

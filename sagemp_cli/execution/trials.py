@@ -31,8 +31,8 @@ class Trials:
     """Rollouts of R references, M of each under each of the D kinds of :data:`DISTURBANCES`.
 
     Attributes:
-        clearance: smallest signed distance to obstacles and workspace over all steps, ``(R, D, M)``; ``-inf`` where
-            the rollout overflowed.
+        clearance: smallest signed distance to obstacles and workspace over the whole of all steps, ``(R, D, M)``;
+            ``-inf`` where the rollout overflowed.
         reached: whether the state at step K was in the goal, ``(R, D, M)``.
         nearest: of the rollouts of each reference and kind that of the least clearance, ``(R, D, K+1, n)``.
     """
@@ -43,7 +43,7 @@ class Trials:
 
     @property
     def safe(self) -> Tensor:
-        """Whether a rollout was in the safe set at all steps, ``(R, D, M)``; it need not have reached the goal."""
+        """Whether a rollout was in the safe set all of the time, ``(R, D, M)``; it need not have reached the goal."""
         return self.clearance > 0
 
 
@@ -141,7 +141,7 @@ def require_certified_safe(certified: Sequence[int], trials: Trials) -> None:
 
 def _judged(states: Tensor, problem: Problem) -> Trials:
     """Of rollouts ``(R, D, M, K+1, n)``."""
-    distance = problem.scene.signed_distance(states[..., list(problem.dynamics.position)]).amin(-1)
+    distance = problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]).amin(-1)
     finite = torch.isfinite(states).flatten(-2).all(-1)
     clearance = torch.where(finite, distance, -torch.inf)
     worst = clearance.argmin(-1)[..., None, None, None].expand(-1, -1, 1, *states.shape[-2:])

@@ -123,9 +123,9 @@ def build_library(
 def reference_faults(references: Tensor, scene: Scene, *, position: tuple[int, ...]) -> list[str]:
     """Why each reference ``(R, K+1, n)`` is out already by itself, or an empty string.
 
-    The states of the steps are checked, not the lines between them: the robot is a discrete-time system.
+    The straight lines from each state to the next are checked, as the robot's are.
     """
-    clear = (scene.signed_distance(references[..., list(position)]) > 0).all(-1)
+    clear = (scene.signed_distance_along(references[..., list(position)]) > 0).all(-1)
     reaches = scene.goal.contains(references[:, -1])
     return [
         REFERENCE_COLLIDES if not c else REFERENCE_MISSES if not g else ""

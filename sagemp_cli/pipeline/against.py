@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from sagemp_cli.checker.balls import BITS, ball, ctx
+from sagemp_cli.checker.between import SEGMENTS
 from sagemp_cli.checker.check import Report, sides
 from sagemp_cli.checker.claim import disturbance_names
 from sagemp_cli.checker.clearance import clearances, goal_margins
@@ -62,6 +63,8 @@ def differences(report: Report, config: Mapping[str, Any]) -> list[Difference]:
         wanted = SetOfConfig.of("start", config["start"], n), SetOfConfig.of("disturbance", config["disturbance"], n)
         found += _boxes("X_I", document, document.sets[0], wanted[0], safe_ones)
         found += _boxes("W", document, document.sets[1], wanted[1], safe_ones)
+        if document.between != SEGMENTS:
+            found.append(Difference("between", document.between, SEGMENTS, covers=False))
         if config["horizon"] != document.horizon:
             found.append(Difference("K", str(document.horizon), str(config["horizon"]), covers=False))
         found += _scene(document, SafeSet.of(config["scene"]), safe_ones)
@@ -114,7 +117,8 @@ def _scene(document: Document, wanted: SafeSet, safe_ones: Sequence[int]) -> Ite
     apart: list[Any] = [None] * len(wanted.names)
     inside: list[Any] = [None] * lower.shape[2]
     if known:
-        apart = clearances(wanted, *(side[..., place].reshape(-1, len(place)) for side in (lower, upper)))
+        places = (side[..., place] for side in (lower, upper))
+        apart = clearances(wanted, *places, between=document.between, parts=document.parts)
         inside = goal_margins(wanted, lower[:, -1].min(axis=0), upper[:, -1].max(axis=0))
     if given.workspace != wanted.workspace:
         covers = wanted.workspace is None or (known and bool(apart[0] > 0))

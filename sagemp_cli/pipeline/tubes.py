@@ -7,7 +7,7 @@ import torch
 
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import PARTS, Between, Box, Tube
 from sagemp_cli.storage import Relaxations, Tubes
 from sagemp_cli.verification.verdict import Outcome, Verdict
 from sagemp_cli.verification.verification import Verification
@@ -30,6 +30,7 @@ def tubes_record(v: Verification) -> Tubes:
         control_upper=v.control_upper.numpy(),
         verdict=tuple(str(x.outcome) for x in v.verdicts),
         step=np.array([x.step for x in v.verdicts], dtype=np.int64),
+        fraction=np.array([x.fraction for x in v.verdicts]),
         constraint=tuple(x.constraint for x in v.verdicts),
         constraint_names=v.constraint_names,
         clearance=v.clearance.numpy(),
@@ -37,6 +38,8 @@ def tubes_record(v: Verification) -> Tubes:
         seconds=v.seconds.numpy(),
         propagator=v.propagator,
         rigorous=v.rigorous,
+        between=str(v.between),
+        parts=1 if v.between is Between.SAMPLES else PARTS,
         relaxations=None if v.recording is None else relaxations_record(v.recording),
     )
 
@@ -55,8 +58,8 @@ def verification_of(record: Tubes, where: str) -> Verification:
     """A stored record as a verification, without what it can be done again from; ``where`` names the file in messages.
 
     Raises:
-        ArtifactError: there are no references, the cells are not sorted by reference, a reference has none, or a
-            verdict is unknown.
+        ArtifactError: there are no references, the cells are not sorted by reference, a reference has none, a
+            verdict is unknown, or what it says of the time between samples.
     """
     if record.references is None:
         raise ArtifactError(f"{where}: /data/tubes holds no references")
@@ -68,7 +71,8 @@ def verification_of(record: Tubes, where: str) -> Verification:
     unknown = [x for x in record.verdict if x not in list(Outcome)]
     if unknown:
         raise ArtifactError(f"{where}: /data/tubes/verdict holds '{unknown[0]}'; known: {', '.join(Outcome)}")
-
+    if record.between not in list(Between):
+        raise ArtifactError(f"{where}: /data/tubes/between is '{record.between}'; known: {', '.join(Between)}")
     return Verification(
         references=torch.from_numpy(record.references),
         start=Box(torch.from_numpy(record.start_lower), torch.from_numpy(record.start_upper)),
@@ -79,8 +83,8 @@ def verification_of(record: Tubes, where: str) -> Verification:
         control_lower=torch.from_numpy(record.control_lower),
         control_upper=torch.from_numpy(record.control_upper),
         verdicts=tuple(
-            Verdict(Outcome(o), int(k), c)
-            for o, k, c in zip(record.verdict, record.step, record.constraint, strict=True)
+            Verdict(Outcome(o), int(k), c, float(s))
+            for o, k, c, s in zip(record.verdict, record.step, record.constraint, record.fraction, strict=True)
         ),
         constraint_names=record.constraint_names,
         clearance=torch.from_numpy(record.clearance),
@@ -89,4 +93,5 @@ def verification_of(record: Tubes, where: str) -> Verification:
         propagator=record.propagator,
         rigorous=bool(record.rigorous),
         recording=None,
+        between=Between(record.between),
     )

@@ -21,7 +21,7 @@ from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.pipeline.models import stand_in
 from sagemp_cli.scenes import Ball, Scene, scene_from_mapping
 from sagemp_cli.sets import Box
-from sagemp_cli.storage import Header
+from sagemp_cli.storage import Counterexample, Header
 
 INK = "#1f2a37"
 MUTED = "#6b7785"
@@ -92,6 +92,12 @@ def subject(header: Header) -> str:
     """The experiment's name, and what stands in for the planner if something does."""
     instead = stand_in(header.config)
     return f"{header.experiment} [plans of a {instead}]" if instead else header.experiment
+
+
+def broken_at(path: np.ndarray, example: Counterexample) -> np.ndarray:
+    """Where on its path ``(K+1, d)`` a counterexample breaks the claim."""
+    after = path[min(example.step + 1, len(path) - 1)]
+    return path[example.step] + example.fraction * (after - path[example.step])
 
 
 def headline(figure: Figure, text: str, subtitle: str, *, colour: str = INK) -> None:

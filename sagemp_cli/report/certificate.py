@@ -23,6 +23,7 @@ from sagemp_cli.report.canvas import (
     VERDICT_COLOURS,
     Setting,
     blank_figure,
+    broken_at,
     draw_boxes,
     draw_scene,
     goal_at_end,
@@ -35,13 +36,14 @@ from sagemp_cli.report.canvas import (
     tube_boxes,
 )
 from sagemp_cli.report.space import space_axes, space_tube
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box, Tube, over_steps
+from sagemp_cli.sets.between import moment
 from sagemp_cli.storage import Artifact, Certificate, Tubes
 
 _SAYS = {
-    "VERIFIED": "Certified at the samples: every start in X$_I$ stays clear and reaches the goal",
-    "FALSIFIED": "Falsified at the samples: a replayed counterexample breaks the claim",
-    "UNKNOWN": "Unknown at the samples: the tube does not prove it, and no counterexample was found",
+    "VERIFIED": "Certified over the whole of every step: every start in X$_I$ stays clear and reaches the goal",
+    "FALSIFIED": "Falsified: a replayed counterexample breaks the claim",
+    "UNKNOWN": "Unknown: the tube does not prove it, and no counterexample was found",
 }
 
 
@@ -67,7 +69,9 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     for example in record.counterexamples:
         path = example.states[:, list(dynamics.position)]
         scene.plot(*path.T, color=DANGER, linewidth=1.6, zorder=8)
-        scene.scatter(*path[example.step], s=46, marker="X", color=DANGER, edgecolor="white", linewidth=0.6, zorder=9)
+        scene.scatter(
+            *broken_at(path, example), s=46, marker="X", color=DANGER, edgecolor="white", linewidth=0.6, zorder=9
+        )
     handles = [
         Line2D([], [], color=REFERENCE, lw=1.2, ls=(0, (4, 2)), label="reference"),
         Line2D([], [], color=INK, lw=0.9, marker="s", mfc="none", ms=7, ls="", label="start cells"),
@@ -153,21 +157,23 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
 
 
 def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -> None:
-    """Certified distance of the tubes to every constraint; where one is not above the red line nothing is proved."""
+    """Certified distance of the tubes to every constraint over each step; not above the red line nothing is proved."""
     index = list(setting.dynamics.position)
     lower, upper = tubes.tube_lower[..., index], tubes.tube_upper[..., index]
     lower = np.nan_to_num(lower, nan=-np.inf, posinf=-np.inf)
     upper = np.nan_to_num(upper, nan=np.inf, neginf=np.inf)
-    found = setting.scene.clearances(Box(torch.from_numpy(lower), torch.from_numpy(upper))).amin(0).numpy()
+    parts = over_steps(Tube(torch.from_numpy(lower), torch.from_numpy(upper)))
+    found = setting.scene.clearances(Box(parts.lower, parts.upper)).amin((0, 2)).numpy()
     style_axes(axes, xlabel="time (s)", ylabel="clearance (m)")
     names = list(tubes.constraint_names)
     if len(names) > 4:  # too many lines to tell apart
         found, names = np.stack([found[:, 0], found[:, 1:].min(1)], axis=1), [names[0], "nearest obstacle"]
     steps = shown_steps(setting, tubes.tube_lower, tubes.tube_upper)
     lines = [axes.axhline(0, color=DANGER, linewidth=1.1, label="contact")]
+    found = np.concatenate([found, found[-1:]])  # of each step up to its end
     for i, name in enumerate(names):
         colour = MUTED if i == 0 else MODES[(i - 1) % len(MODES)]
-        lines += axes.plot(times[:steps], found[:steps, i], color=colour, linewidth=1.3, label=name)
+        lines += axes.step(times[:steps], found[:steps, i], where="post", color=colour, linewidth=1.3, label=name)
     if steps < len(times):
         axes.axvline(times[steps], color=UNKNOWN, linewidth=1.1, linestyle=(0, (2, 2)))
     finite = found[:steps][np.isfinite(found[:steps])]
@@ -190,9 +196,10 @@ def _about_model(record: Certificate, dynamics: Dynamics) -> str:
 
 def _deciding(tubes: Tubes) -> str:
     """The verdict of the worst reference, in words."""
+    words = Between(tubes.between).words
     open_ones = [r for r, v in enumerate(tubes.verdict) if v != "SAFE"]
     if open_ones:
         r = open_ones[0]
-        return f"{tubes.verdict[r]} at step {tubes.step[r]} ({tubes.constraint[r]})"
+        return f"{tubes.verdict[r]} at {moment(int(tubes.step[r]), float(tubes.fraction[r]))} ({tubes.constraint[r]})"
     r, c = np.unravel_index(tubes.clearance.argmin(), tubes.clearance.shape)
-    return f"SAFE at the samples, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"
+    return f"SAFE {words}, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"

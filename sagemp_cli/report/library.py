@@ -79,7 +79,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         f"{subject(artifact.header)}: {record.sampled} references sampled, "
         f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s; "
-        f"certified clearance at least {tubes.clearance.min():.2f} m at the samples",
+        f"certified clearance at least {tubes.clearance.min():.2f} m over the whole of every step",
         colour=SAFE if count >= record.wanted else INK,
     )
     return figure

@@ -96,7 +96,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
         f"{subject(artifact.header)}: {len(record.chosen)} starts measured in X$_I$, closest of "
         f"{len(tubes.verdict)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
         "random and worst-case disturbances; "
-        f"{safe} of {total} kept clear and reached the goal, at the samples",
+        f"{safe} of {total} kept clear over the whole of every step and reached the goal",
         colour=SAFE if inside == total else DANGER,
     )
     return figure

@@ -70,7 +70,7 @@ def draw_safety(artifact: Artifact[SafetyRates]) -> Figure:
         f"{proof_row.safe} proved",
         f"{subject(artifact.header)}: {open_row.rollouts} rollouts of each plan under each kind of disturbance w, "
         f"those of least clearance shown; a plan is safe if all are. {record.propagator} proved {proof_row.safe} in "
-        f"{record.seconds.sum():.2g} s; all of it at the samples",
+        f"{record.seconds.sum():.2g} s; safe is: over the whole of every step",
     )
     return figure
 

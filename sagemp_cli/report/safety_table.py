@@ -114,8 +114,8 @@ def table_lines(rows: Sequence[SafetyRow]) -> Iterator[str]:
     for line in cells:
         yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
     yield ""
-    yield "Safe: in the safe set at all samples, from starts all over X_I. A reference is safe if all its rollouts are,"
-    yield "under no, random and worst-case disturbances w; the columns w give the share of the rollouts that are."
+    yield "Safe: in the safe set over the whole of every step, from starts all over X_I. A reference is safe if all its"
+    yield "rollouts are, under no, random and worst-case disturbances w; the columns w give the share of them that are."
     yield "Certified: proved from all of X_I under all w; its rollouts are the closed-loop ones of these references."
 
 

@@ -23,6 +23,7 @@ from sagemp_cli.report.canvas import (
     UNKNOWN,
     VERDICT_COLOURS,
     blank_figure,
+    broken_at,
     draw_boxes,
     headline,
     legend_above,
@@ -31,6 +32,7 @@ from sagemp_cli.report.canvas import (
     unit_text,
 )
 from sagemp_cli.scenes.scene import Ball, Scene
+from sagemp_cli.sets.between import Between, moment
 from sagemp_cli.storage import Counterexample, Tubes
 
 _SAYS = {
@@ -105,8 +107,7 @@ def draw_loop(tubes: Tubes, setting: LoopSetting, verdict: str, examples: Sequen
         figure,
         _SAYS[verdict] + (f": {_aim(setting)}" if verdict == "VERIFIED" else ""),
         f"{setting.name}: {_deciding(tubes)}; {len(tubes.cell_lower)} cell{'s' * (len(tubes.cell_lower) > 1)}, "
-        f"K = {steps}{duration}, {tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; what holds is about the "
-        "samples",
+        f"K = {steps}{duration}, {tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}{_when(tubes, setting)}",
         colour=VERDICT_COLOURS.get(verdict, INK),
     )
     return figure
@@ -126,8 +127,14 @@ def _aim(setting: LoopSetting) -> str:
 
 def _deciding(tubes: Tubes) -> str:
     if tubes.verdict[0] == "SAFE":
-        return "SAFE at all steps"
-    return f"{tubes.verdict[0]} at step {tubes.step[0]} ({tubes.constraint[0]})"
+        return "SAFE"
+    return f"{tubes.verdict[0]} at {moment(int(tubes.step[0]), float(tubes.fraction[0]))} ({tubes.constraint[0]})"
+
+
+def _when(tubes: Tubes, setting: LoopSetting) -> str:
+    """When the scene is kept clear of, if it asks for that."""
+    asked = setting.scene.workspace.has_faces or setting.scene.obstacles
+    return f"; clear {Between(tubes.between).words}" if asked else ""
 
 
 def _shown(tubes: Tubes) -> int:
@@ -202,7 +209,7 @@ def _map(axes: Axes, tubes: Tubes, setting: LoopSetting, shown: int, examples: S
     for example in examples:
         path = example.states[:, plane]
         axes.plot(*path.T, color=DANGER, linewidth=1.6, zorder=8)
-        axes.scatter(*path[example.step], s=46, marker="X", color=DANGER, zorder=9)
+        axes.scatter(*broken_at(path, example), s=46, marker="X", color=DANGER, zorder=9)
     points = [p for p in (lower.reshape(-1, 2).min(0), upper.reshape(-1, 2).max(0), *corners) if np.isfinite(p).all()]
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     pad = 0.03 * np.maximum(high - low, 1e-9)

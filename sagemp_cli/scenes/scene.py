@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.scenes.objects import OBJECTS
+from sagemp_cli.scenes.segments import along, deepest
 from sagemp_cli.sets import Box, round_down, round_up
 
 
@@ -30,6 +31,12 @@ class Ball:
     def signed_distance(self, p: Tensor) -> Tensor:
         """Distance of points ``(..., d)`` to the surface, negative inside (round to nearest)."""
         return torch.linalg.vector_norm(p - torch.tensor(self.center, dtype=p.dtype), dim=-1) - self.radius
+
+    def nearest(self, path: Tensor) -> Tensor:
+        """Where in [0, 1] each straight piece of paths ``(..., K+1, d)`` is nearest or deepest, ``(..., K)``."""
+        first, way = path[..., :-1, :], path.diff(dim=-2)
+        ahead = ((torch.tensor(self.center, dtype=path.dtype) - first) * way).sum(-1)
+        return (ahead / way.square().sum(-1).clamp(min=_TINY)).clamp(0.0, 1.0)
 
     def clearance(self, box: Box) -> Tensor:
         """A lower bound on the distance between boxes ``(..., d)`` and the ball, rounded down; <= 0 may touch.
@@ -71,6 +78,11 @@ class Block:
         gap = torch.maximum(low - p, p - high)
         return torch.linalg.vector_norm(gap.clamp(min=0.0), dim=-1) + gap.amax(-1).clamp(max=0.0)
 
+    def nearest(self, path: Tensor) -> Tensor:
+        """As of a :class:`Ball`."""
+        low, high = (torch.tensor(v, dtype=path.dtype) for v in (self.lower, self.upper))
+        return deepest(path, low, high, self.signed_distance)
+
     def clearance(self, box: Box) -> Tensor:
         """A lower bound on the largest per-axis gap between boxes and the block, rounded down; <= 0 may touch."""
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (self.lower, self.upper))
@@ -83,6 +95,8 @@ class Block:
 
 
 Obstacle = Ball | Block
+
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -122,6 +136,16 @@ class Scene:
         """Smallest distance of points ``(..., d)`` to any obstacle or the workspace's outside, negative if unsafe."""
         inside = torch.minimum(p - self.workspace.lower.to(p), self.workspace.upper.to(p) - p).amin(-1)
         return torch.stack([inside, *(o.signed_distance(p) for o in self.obstacles)], dim=-1).amin(-1)
+
+    def signed_distance_along(self, path: Tensor) -> Tensor:
+        """The same over the whole of each straight piece of paths ``(..., K+1, d)``, ``(..., K)``.
+
+        The workspace is convex: a piece leaves it if and only if one of its ends does.
+        """
+        inside = torch.minimum(path - self.workspace.lower.to(path), self.workspace.upper.to(path) - path).amin(-1)
+        least = torch.minimum(inside[..., :-1], inside[..., 1:])
+        over = [o.signed_distance(along(path, o.nearest(path))) for o in self.obstacles]
+        return torch.stack([least, *over], dim=-1).amin(-1)
 
     def clearances(self, box: Box) -> Tensor:
         """Lower bounds on the clearance of position boxes ``(..., d)``: last dimension is [workspace, obstacles...].

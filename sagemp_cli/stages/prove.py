@@ -20,7 +20,7 @@ from sagemp_cli.reachability.propagator import Loop, Propagator
 from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.strangers_loop import LoopSetting, draw_loop
 from sagemp_cli.scenes.scene import scene_from_mapping
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box
 from sagemp_cli.storage import Certificate, Counterexample, Header, refuse_existing, write_artifact
 from sagemp_cli.verification.attack.falsifier import Counterexample as Found
 from sagemp_cli.verification.strangers_loop import LoopClaim, LoopProof, verify_loop
@@ -38,6 +38,7 @@ def prove(
     scene: Mapping[str, Any] | None = None,
     goal: Box | None = None,
     position: Sequence[int | str] | None = None,
+    between: str = "segments",
     state_names: Sequence[str] | None = None,
     state_units: Sequence[str] | None = None,
     dt: float | None = None,
@@ -63,6 +64,9 @@ def prove(
         goal: box over the state ``(n,)`` at step K, infinite where any value will do; instead of the scene's.
         position: the states that the scene is about, by number or name; by default the first ones, as many as it has
             dimensions.
+        between: ``"segments"``: the position moves along a straight line within a step, as under forward Euler, and has
+            to keep clear over the whole of it. ``"samples"``: it has to at the samples only, for a step that is no
+            such motion; the verdict then says nothing of the time between them.
         state_names, state_units: n words each; ``x0``, ``x1``, ... by default.
         dt: seconds between samples, for the figure.
         partitions: cells as of ``reach``; ``"auto"`` splits where the claim is not proved yet.
@@ -87,7 +91,9 @@ def prove(
     names = _words("state_names", state_names, [f"x{i}" for i in range(n)])
     units = _words("state_units", state_units, [""] * n)
     problem = _scene(scene, goal)
-    claim = _claim(problem, names, position)
+    if between not in (Between.SEGMENTS, Between.SAMPLES):
+        raise UsageError(f"between must be '{Between.SEGMENTS}' or '{Between.SAMPLES}', found {between!r}")
+    claim = _claim(problem, names, position, Between(between))
     if dt is not None and not (isinstance(dt, int | float) and 0 < dt < math.inf):
         raise UsageError(f"dt must be a positive number of seconds, found {dt!r}")
     chosen, counts = propagator_of(propagator), counts_of(partitions, start)
@@ -157,7 +163,9 @@ def _scene(given: Mapping[str, Any] | None, goal: Box | None) -> dict[str, Any]:
     return scene if scene.keys() & {"workspace", "obstacles", "goal"} else {}
 
 
-def _claim(scene: Mapping[str, Any], names: tuple[str, ...], position: Sequence[int | str] | None) -> LoopClaim:
+def _claim(
+    scene: Mapping[str, Any], names: tuple[str, ...], position: Sequence[int | str] | None, between: Between
+) -> LoopClaim:
     """What a scene claims; what it does not say is infinite."""
     n = len(names)
     d = _dimensions(scene)
@@ -169,7 +177,8 @@ def _claim(scene: Mapping[str, Any], names: tuple[str, ...], position: Sequence[
     chosen = chosen if d else [0]
     everywhere = lambda size: {"lower": [-math.inf] * size, "upper": [math.inf] * size}  # noqa: E731
     full = {"workspace": everywhere(len(chosen)), "obstacles": [], "goal": everywhere(n)} | dict(scene)
-    return LoopClaim(scene_from_mapping(full, state_dim=n, position_dim=len(chosen)), tuple(chosen), names)
+    made = scene_from_mapping(full, state_dim=n, position_dim=len(chosen))
+    return LoopClaim(made, tuple(chosen), names, between)
 
 
 def _dimensions(scene: Mapping[str, Any]) -> int:
@@ -201,6 +210,7 @@ def _counterexample(found: Found, claim: LoopClaim) -> Counterexample:
         reference=0,
         kind="collision" if found.kind == "obstacle" else found.kind,
         step=found.step,
+        fraction=found.fraction,
         constraint=f"goal {claim.state_names[found.state]}" if goal else found.name,
         depth=found.depth,
         states=found.states.numpy(),

@@ -89,6 +89,7 @@ def run(context: StageContext) -> Path:
         closed_loop=_trials(tried.closed_loop),
         verdict=tuple(str(v.outcome) for v in proved.verdicts),
         step=np.array([v.step for v in proved.verdicts], dtype=np.int64),
+        fraction=np.array([v.fraction for v in proved.verdicts]),
         constraint=tuple(v.constraint for v in proved.verdicts),
         tube_lower=np.stack([tube.lower.numpy() for tube in tubes]),
         tube_upper=np.stack([tube.upper.numpy() for tube in tubes]),

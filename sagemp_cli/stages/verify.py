@@ -128,6 +128,7 @@ def _counterexample(reference: int, found: Found, constraint: str) -> Counterexa
         reference=reference,
         kind="collision" if found.kind == "obstacle" else found.kind,
         step=found.step,
+        fraction=found.fraction,
         constraint=constraint,
         depth=found.depth,
         states=found.states.numpy(),

@@ -149,10 +149,14 @@ class Tubes:
     control_upper: np.ndarray = array("count K m", "upper bounds of the controls over all cells", finite=False)
     verdict: tuple[str, ...] = texts("count", "SAFE, MAY_COLLIDE, MISSES_GOAL, UNBOUNDED or UNSAFE")
     step: np.ndarray = array("count", "step that decided the verdict (-1: none, SAFE)", dtype="int64")
+    fraction: np.ndarray = array("count", "part of that step that was over when it was decided, 0 or more, below 1")
     constraint: tuple[str, ...] = texts("count", "obstacle, workspace or goal dimension that decided ('' if SAFE)")
     constraint_names: tuple[str, ...] = texts("constraints", "names of the constraints of 'clearance'")
     clearance: np.ndarray = array(
-        "count constraints", "smallest certified distance to each constraint", units="m", finite=False
+        "count constraints",
+        "smallest certified distance to each constraint over all of the time",
+        units="m",
+        finite=False,
     )
     goal_margin: np.ndarray = array(
         "count n", "distance of the tube at K from the goal's faces (negative: outside)", finite=False
@@ -160,6 +164,8 @@ class Tubes:
     seconds: np.ndarray = array("count", "share of the proof time", units="s")
     propagator: str = scalar("propagator that made the tubes")
     rigorous: bool = scalar("whether rounding is included in the tubes")
+    between: str = scalar("'segments': the safe set is kept over the whole of every step; 'samples': at samples only")
+    parts: int = scalar("parts of a step that were checked one by one; 1 with 'samples'")
     relaxations: Relaxations | None = group(Relaxations, "what the proof can be done again from", optional=True)
 
 
@@ -170,6 +176,7 @@ class Counterexample:
     reference: int = scalar("index of the reference")
     kind: str = scalar("'collision', 'workspace' or 'goal'")
     step: int = scalar("step of the violation")
+    fraction: float = scalar("part of that step that is over at the violation, 0 or more, below 1")
     constraint: str = scalar("obstacle, 'workspace' or goal dimension")
     depth: float = scalar("depth of the violation (> 0)")
     states: np.ndarray = array("K+1 n", "replayed states")
@@ -239,7 +246,9 @@ class Rollouts:
     controls: np.ndarray = array("rollouts K m", "executed controls")
     disturbances: np.ndarray = array("rollouts K n", "disturbances")
     in_tube: np.ndarray = array("rollouts", "whether the whole rollout stayed in its tube", dtype="bool")
-    safe: np.ndarray = array("rollouts", "whether it stayed in the safe set and reached the goal", dtype="bool")
+    safe: np.ndarray = array(
+        "rollouts", "whether it stayed in the safe set over the whole of every step and reached the goal", dtype="bool"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,7 +257,7 @@ class Trials:
 
     clearance: np.ndarray = array(
         "count kinds rollouts",
-        "smallest signed distance to obstacles and workspace over all steps",
+        "smallest signed distance to obstacles and workspace over the whole of all steps",
         units="m",
         finite=False,
     )
@@ -272,6 +281,7 @@ class SafetyRates:
     closed_loop: Trials = group(Trials, "the references tracked")
     verdict: tuple[str, ...] = texts("count", "of the proof over all of X_I: SAFE (certified) or why it is not")
     step: np.ndarray = array("count", "step that decided the verdict (-1: none, SAFE)", dtype="int64")
+    fraction: np.ndarray = array("count", "part of that step that was over when it was decided, 0 or more, below 1")
     constraint: tuple[str, ...] = texts("count", "obstacle, workspace or goal dimension that decided ('' if SAFE)")
     tube_lower: np.ndarray = array("count K+1 n", "lower bounds of each reference's tube, all cells", finite=False)
     tube_upper: np.ndarray = array("count K+1 n", "upper bounds of each reference's tube, all cells", finite=False)
@@ -302,10 +312,10 @@ KINDS = (
     Kind("dynamics", 1, DynamicsModel),
     Kind("planner", 1, PlannerModel),
     Kind("tracker", 1, TrackerModel),
-    Kind("certificate", 2, Certificate, oldest=2, command="sagemp verify --overwrite"),
-    Kind("library", 2, Library, oldest=2, command="sagemp build-library --overwrite"),
-    Kind("rollouts", 1, Rollouts),
-    Kind("safety", 1, SafetyRates),
+    Kind("certificate", 3, Certificate, oldest=3, command="sagemp verify --overwrite"),
+    Kind("library", 3, Library, oldest=3, command="sagemp build-library --overwrite"),
+    Kind("rollouts", 2, Rollouts, oldest=2, command="sagemp execute --overwrite"),
+    Kind("safety", 2, SafetyRates, oldest=2, command="sagemp safety-rates --overwrite"),
 )
 
 

@@ -1,8 +1,8 @@
 """The verdict about a stranger's loop: its recorded program bounded, judged and attacked as our own loops are.
 
 There is no robot, no tracker and no reference here: the loop is a program, and the claim is that from every start in
-X_I and under every disturbance its states keep clear of what a scene says and are in a goal at step K, as far as there
-is a scene and a goal.
+X_I and under every disturbance its states, and the straight lines between them unless only the samples are asked for,
+keep clear of what a scene says, and are in a goal at step K, as far as there is a scene and a goal.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from sagemp_cli.reachability.observed import Observed
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.scenes.scene import Scene
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Between, Box, Tube
+from sagemp_cli.sets.between import moment
 from sagemp_cli.verification.adaptive import adaptive_cells
 from sagemp_cli.verification.attack.ascent import simulate
 from sagemp_cli.verification.attack.falsifier import Counterexample, falsify, margins
@@ -43,11 +44,14 @@ class LoopClaim:
         scene: workspace and obstacles over the position, goal over the state; infinite where nothing is asked for.
         position: entries of the state that are the position.
         state_names: n names.
+        between: whether the loop is claimed to keep clear along straight lines between its samples too. Whether it
+            moves along them is for those to say who know what it is a model of.
     """
 
     scene: Scene
     position: tuple[int, ...]
     state_names: tuple[str, ...]
+    between: Between = Between.SEGMENTS
 
     @property
     def bounds_the_position(self) -> bool:
@@ -144,6 +148,7 @@ def verify_loop(
         cell_reference=found.cell_reference,
         position=claim.position,
         state_names=claim.state_names,
+        between=claim.between,
     )
     n, steps = seen.start.dim, seen.loop.horizon
     first = 0 if claim.bounds_the_position else 1  # a workspace that is not there is no constraint
@@ -165,6 +170,7 @@ def verify_loop(
         rigorous=propagator.rigorous,
         recording=found.recording,
         notes=found.notes,
+        between=claim.between,
     )
     return _attacked(seen, claim, verification, restarts, generator)
 
@@ -189,7 +195,7 @@ class _Cells:
 
 
 def _shortfall(tube: Tube, claim: LoopClaim) -> tuple[Tensor, Tensor]:
-    safe, missing = shortfall(tube, claim.scene, position=claim.position)
+    safe, missing = shortfall(tube, claim.scene, position=claim.position, between=claim.between)
     return safe, torch.nan_to_num(missing, nan=1e300, posinf=1e300)
 
 
@@ -204,7 +210,8 @@ def _breaks(seen: Observed, claim: LoopClaim, cells: Box) -> Tensor:
 
 def _problem(seen: Observed, claim: LoopClaim) -> Problem:
     """The claim as attacks want it. Of the robot, which there is none, they ask only where the position is."""
-    return Problem(cast(Dynamics, claim), claim.scene, seen.start, seen.disturbance, seen.loop.horizon)
+    robot = cast(Dynamics, claim)
+    return Problem(robot, claim.scene, seen.start, seen.disturbance, seen.loop.horizon, claim.between)
 
 
 def _attacked(
@@ -228,9 +235,9 @@ def _attacked(
     name = f"goal {claim.state_names[example.state]}" if example.kind == "goal" else example.name
     if safe:
         raise SoundnessError(
-            f"the loop was certified by '{verification.propagator}', but a replayed rollout breaks '{name}' at step "
-            f"{example.step} by {example.depth:.3g}; please report this"
+            f"the loop was certified by '{verification.propagator}', but a replayed rollout breaks '{name}' at "
+            f"{moment(example.step, example.fraction)} by {example.depth:.3g}; please report this"
         )
-    verdicts = (Verdict(Outcome.UNSAFE, example.step, name),)
+    verdicts = (Verdict(Outcome.UNSAFE, example.step, name, example.fraction),)
     refuted = dataclasses.replace(verification, verdicts=verdicts)
     return LoopProof(seen.loop, claim, refuted, example, None, rollouts)

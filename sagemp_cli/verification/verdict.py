@@ -15,14 +15,15 @@ from torch import Tensor
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.scenes.scene import Scene
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import PARTS, Between, Box, Bulge, Tube, over_steps
+from sagemp_cli.sets.between import moment
 
 
 class Outcome(StrEnum):
     """What is known about one reference."""
 
     SAFE = "SAFE"
-    """Proved: the tube keeps clear at every step and lies in the goal at step K."""
+    """Proved: the tube keeps clear over the whole of every step and lies in the goal at step K."""
     MAY_COLLIDE = "MAY_COLLIDE"
     """The tube touches an obstacle or the workspace's boundary."""
     MISSES_GOAL = "MISSES_GOAL"
@@ -48,17 +49,20 @@ class Verdict:
     Attributes:
         outcome: see :class:`Outcome`.
         step: the earliest step that decided; -1 if SAFE.
+        fraction: of that step, in [0, 1): nothing happens before it is over, and from there on it is not proved (or
+            refuted).
         constraint: obstacle, ``workspace``, ``goal <state>``, or the state that overflowed; empty if SAFE.
     """
 
     outcome: Outcome
     step: int = -1
     constraint: str = ""
+    fraction: float = 0.0
 
     def __str__(self) -> str:
         if self.outcome is Outcome.SAFE:
             return str(self.outcome)
-        return f"{self.outcome} at step {self.step} ({self.constraint})"
+        return f"{self.outcome} at {moment(self.step, self.fraction)} ({self.constraint})"
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,8 @@ class Assessment:
 
     Attributes:
         verdicts: one each.
-        clearance: ``(R, constraints)``, certified lower bound on the distance to each constraint over all steps
-            and cells, ``-inf`` where the tube overflowed.
+        clearance: ``(R, constraints)``, certified lower bound on the distance to each constraint over all of the time
+            and all cells, ``-inf`` where the tube overflowed.
         goal_margin: ``(R, n)``, distance of the tube at K from the goal's faces, negative outside, ``inf`` where
             the goal has no face.
     """
@@ -85,12 +89,15 @@ def assess(
     cell_reference: Tensor,
     position: Sequence[int],
     state_names: Sequence[str],
+    between: Between = Between.SEGMENTS,
+    bulge: Bulge | None = None,
 ) -> Assessment:
     """Judge the tubes ``(C, K+1, n)`` of the cells of R references; those of one together cover its start box.
 
-    SAFE needs every cell's tube to be finite, clear of all constraints at every step k = 0..K and inside the goal at
-    K. The paper asks for k = 1..K only; a start box in collision is not called safe here. A tube that touches an
-    obstacle is not clear of it. Of several violations the earliest step is named, and there the constraint that
+    SAFE needs every cell's tube to be finite, clear of all constraints over the whole of every step, from k = 0 to K,
+    and inside the goal at K. Each step is checked in :data:`~sagemp_cli.sets.between.PARTS` parts. The paper asks for
+    the samples k = 1..K only; a start box in collision is not called safe here. A tube that touches an obstacle is not
+    clear of it. Of several violations the earliest part of a step is named by its begin, and there the constraint that
     is violated most; an overflow anywhere makes the whole tube UNBOUNDED.
 
     Args:
@@ -99,6 +106,8 @@ def assess(
         cell_reference: which reference each cell belongs to, ``(C,)``, each of 0..R-1 at least once.
         position: indices of the states that are the position.
         state_names: names for messages, n of them.
+        between: with ``SAMPLES`` the states at the samples have to keep clear and nothing else.
+        bulge: what leaves the straight lines between the samples, ``(C, K, n)``.
 
     Raises:
         UsageError: a reference without cells, of which nothing is proved.
@@ -106,8 +115,9 @@ def assess(
     count = int(cell_reference.max()) + 1 if len(cell_reference) else 0
     if len(cell_reference) != len(tube.lower) or not torch.equal(cell_reference.unique(), torch.arange(count)):
         raise UsageError(f"every one of {count} references needs cells, and every cell a reference")
-    found = _measure(tube, scene, position)
-    clearances = _least(found.clearances, cell_reference, count)  # (R, K+1, constraints)
+    found = _measure(tube, scene, position, between, bulge)
+    parts = 1 if between is Between.SAMPLES else PARTS
+    clearances = _least(found.clearances, cell_reference, count)  # (R, parts of all steps, constraints)
     goal_margin = _least(found.goal_margin, cell_reference, count)
     reaches = _least(found.reaches, cell_reference, count)
     finite = _least(found.finite, cell_reference, count)  # (R, K+1, n)
@@ -118,9 +128,9 @@ def assess(
             step = _first(~finite[r].all(-1))
             verdicts.append(Verdict(Outcome.UNBOUNDED, step, state_names[_first(~finite[r, step])]))
         elif not bool((clearances[r] > 0).all()):
-            step = _first(~(clearances[r] > 0).all(-1))
-            name = scene.constraint_names[int(clearances[r, step].argmin())]
-            verdicts.append(Verdict(Outcome.MAY_COLLIDE, step, name))
+            place = _first(~(clearances[r] > 0).all(-1))
+            name = scene.constraint_names[int(clearances[r, place].argmin())]
+            verdicts.append(Verdict(Outcome.MAY_COLLIDE, place // parts, name, place % parts / parts))
         elif not bool(reaches[r]):
             name = state_names[int(goal_margin[r].argmin())]
             verdicts.append(Verdict(Outcome.MISSES_GOAL, tube.horizon, f"goal {name}"))
@@ -129,16 +139,24 @@ def assess(
     return Assessment(tuple(verdicts), clearances.amin(1), goal_margin)
 
 
-def shortfall(tube: Tube, scene: Scene, *, position: Sequence[int]) -> tuple[Tensor, Tensor]:
+def shortfall(
+    tube: Tube,
+    scene: Scene,
+    *,
+    position: Sequence[int],
+    between: Between = Between.SEGMENTS,
+    bulge: Bulge | None = None,
+) -> tuple[Tensor, Tensor]:
     """How far each of the tubes ``(C, K+1, n)`` is from being SAFE by itself.
 
     Returns:
         Whether it is SAFE, as in :func:`assess`, ``(C,)``; and a measure of what is missing, 0 if nothing is, ``(C,)``:
-        the sum over all steps, constraints and faces of the goal of ``log(1 + depth)``. It guides, it proves nothing.
+        the sum over all constraints, faces of the goal and steps (of each the mean over its parts) of
+        ``log(1 + depth)``. It guides, it proves nothing.
     """
-    found = _measure(tube, scene, position)
+    found = _measure(tube, scene, position, between, bulge)
     safe = found.finite.flatten(1).all(1) & (found.clearances > 0).flatten(1).all(1) & found.reaches
-    depth = torch.log1p((-found.clearances).clamp(min=0.0, max=_HUGE)).sum((1, 2))
+    depth = torch.log1p((-found.clearances).clamp(min=0.0, max=_HUGE)).mean(1).sum(1) * (tube.horizon + 1)
     short = torch.log1p((-found.goal_margin).clamp(min=0.0, max=_HUGE)).sum(1)
     return safe, torch.where(safe, 0.0, depth + tube.horizon * short)
 
@@ -148,7 +166,8 @@ _HUGE = 1e300
 
 @dataclass(frozen=True)
 class _Measures:
-    """Of each cell: bounds that are finite, clearances and goal margins, and whether it ends in the goal."""
+    """Of each cell: bounds that are finite, clearances of all parts of all steps in turn (or at the samples), goal
+    margins, and whether it ends in the goal."""
 
     finite: Tensor
     clearances: Tensor
@@ -156,17 +175,24 @@ class _Measures:
     reaches: Tensor
 
 
-def _measure(tube: Tube, scene: Scene, position: Sequence[int]) -> _Measures:
+def _measure(tube: Tube, scene: Scene, position: Sequence[int], between: Between, bulge: Bulge | None) -> _Measures:
     finite = torch.isfinite(tube.lower) & torch.isfinite(tube.upper)
     everywhere = torch.full_like(tube.lower, torch.inf)
     lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
     index = list(position)
+    places = Tube(lower[..., index], upper[..., index])
+    if between is Between.SAMPLES:
+        over = Box(places.lower, places.upper)
+    else:
+        bends = None if bulge is None else Bulge(*(b[..., index] for b in (bulge.curve, bulge.swing, bulge.rest)))
+        parts = over_steps(places, bends)
+        over = Box(parts.lower.flatten(-3, -2), parts.upper.flatten(-3, -2))
     goal_margin = torch.minimum(
         _margin(lower[..., -1, :], scene.goal.lower), _margin(-upper[..., -1, :], -scene.goal.upper)
     )
     return _Measures(
         finite,
-        scene.clearances(Box(lower[..., index], upper[..., index])),
+        scene.clearances(over),
         goal_margin,
         scene.goal.contains(Box(lower[..., -1, :], upper[..., -1, :])),
     )

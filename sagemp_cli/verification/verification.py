@@ -1,9 +1,9 @@
 """Verification of references: the one path that ``verify`` and ``build-library`` share.
 
 Partition the start box, propagate every cell, judge the union, bound the controls. What is claimed of a SAFE
-reference: for every start in X_I and every disturbance sequence in W^K the closed loop stays in the tube, the
-tube is in the safe set at every step and in the goal at step K; with rounding included if the propagator is
-rigorous, in exact arithmetic otherwise.
+reference: for every start in X_I and every disturbance sequence in W^K the closed loop stays in the tube, it is in the
+safe set over the whole of every step and in the goal at step K; with rounding included if the propagator is rigorous,
+in exact arithmetic otherwise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Between, Box, Tube
 from sagemp_cli.sets.partition import partition, uncertain_dimensions
 from sagemp_cli.verification.adaptive import adaptive_cells
 from sagemp_cli.verification.cells import CellProver, CellTubes, Chunk, Pieces, Run
@@ -49,6 +49,7 @@ class Verification:
         rigorous: whether rounding is included in the tubes.
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
         notes: of the propagator, one line each.
+        between: what the verdicts say of the time between two samples.
     """
 
     references: Tensor
@@ -68,6 +69,7 @@ class Verification:
     rigorous: bool
     recording: Recording | None = None
     notes: tuple[str, ...] = ()
+    between: Between = Between.SEGMENTS
 
     def __len__(self) -> int:
         return self.references.shape[0]
@@ -196,7 +198,7 @@ def verify_references(
                 work,
                 start,
                 budget=budget,
-                shortfall=lambda tube: shortfall(tube, scene, position=dynamics.position),
+                shortfall=lambda tube: shortfall(tube, scene, position=dynamics.position, between=problem.between),
                 hopeless=lambda owner, cells: _breaks(prover, references[owner], cells),
             )
         else:
@@ -209,6 +211,7 @@ def verify_references(
         cell_reference=found.cell_reference,
         position=dynamics.position,
         state_names=dynamics.state_names,
+        between=problem.between,
     )
     mine = [found.cell_reference == r for r in range(count)]
     return Verification(
@@ -229,6 +232,7 @@ def verify_references(
         rigorous=propagator.rigorous,
         recording=found.recording,
         notes=found.notes,
+        between=problem.between,
     )
 
 
@@ -276,7 +280,7 @@ def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
     w = problem.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
         states, _ = loop.rollout(x, w)
-    clear = problem.scene.signed_distance(states[..., list(problem.dynamics.position)]) > 0
+    clear = problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]) > 0
     return (~(clear.all(-1) & problem.scene.goal.contains(states[..., -1, :]))).any(0)
 
 

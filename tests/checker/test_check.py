@@ -71,15 +71,15 @@ def test_tubes_without_relaxations_cannot_be_checked(case, tmp_path):
     assert run(path).exit_code == 5
 
 
-def falsified(case, path, *, depth_step=8):
+def falsified(case, path, *, depth_step=8, fraction=0.0):
     """A certificate with a rollout through the disc."""
     loop = ClosedLoop(case.problem.dynamics, case.tracker, torch.from_numpy(case.tubes.references[0]))
     w = torch.zeros(8, 4, dtype=torch.float64)
     states, _ = loop.rollout(case.problem.start.center, w)
     unsafe = dataclasses.replace(case.tubes, verdict=("UNSAFE",), step=np.array([depth_step]), constraint=("disc",))
     example = Counterexample(
-        reference=0, kind="collision", step=depth_step, constraint="disc", depth=0.1, states=states.detach().numpy(),
-        disturbances=w.numpy(),
+        reference=0, kind="collision", step=depth_step, fraction=fraction, constraint="disc", depth=0.1,
+        states=states.detach().numpy(), disturbances=w.numpy(),
     )  # fmt: skip
     return case.write(path, tubes=unsafe, verdict="FALSIFIED", counterexamples=(example,))
 
@@ -88,6 +88,36 @@ def test_a_counterexample_is_replayed_and_proved(make, tmp_path):
     path = falsified(make(disc=[0.6, 0.3]), tmp_path / "certificate.h5")
     assert check(path).answer == "FALSIFIED"
     assert run(path).exit_code == 10
+
+
+def test_a_counterexample_between_two_samples_is_proved_there_and_nowhere_else(make, mutate, tmp_path):
+    case = make()
+    case.config["scene"]["obstacles"][0].update(center=[0.45, 0.0], radius=0.03)  # between the samples at 0.4 and 0.5
+    path = falsified(case, tmp_path / "certificate.h5", depth_step=4, fraction=0.5)
+    assert check(path).answer == "FALSIFIED"
+
+    def at(step, fraction, between="segments"):
+        def change(file):
+            file["data/counterexamples/000000"].attrs["step"] = step
+            file["data/counterexamples/000000"].attrs["fraction"] = fraction
+            file["data/tubes"].attrs.update(between=between, parts=1 if between == "samples" else 8)
+
+        return check(mutate(path, tmp_path / "mutant.h5", change))
+
+    for step, fraction in (
+        (4, 0.0),
+        (5, 0.0),
+        (4, 0.05),
+        (3, 0.5),
+        (4, 1.5),
+        (3, 1.5),
+        (5, -0.5),
+        (8, 0.5),
+        (4, np.nan),
+    ):
+        assert at(step, fraction).answer == "UNKNOWN", (step, fraction)
+    found = at(4, 0.5, "samples")  # of the time between the samples nothing is claimed there
+    assert found.answer == "UNKNOWN" and "none that the claim speaks of" in found.counterexamples[0][1]
 
 
 def test_a_counterexample_that_violates_nothing_or_cheats_proves_nothing(make, mutate, tmp_path):

@@ -41,7 +41,8 @@ def test_the_claim_is_there_in_full_with_names_and_units(certificate):
     assert found["X_I"] == "px -0.05 to 0.05 m, py -0.04 to 0.04 m, theta 0 rad, v 1 m/s"
     assert found["W"].startswith("w_px -0.05 to 0.05, w_py 0, ")
     assert found["w enters"] == "px + 0.1 w_px, py + 0.1 w_py, theta + 0.1 w_theta, v + 0.1 w_v"
-    assert "K = 8 steps, at the samples" in found["for"]
+    assert found["for"].endswith("K = 8 steps")
+    assert found["between"].startswith("segments: the safe set is kept over the whole of every step, on the straight")
     assert found["obstacle"] == "disc: ball around (0.4, 1), radius 0.5"
     assert found["goal at K"].startswith("px 0.3 to 1.3 m") and "turn_rate" in found["controls"]
     assert found["reference 0"].startswith("from px 0, py 0, theta 0, v 1 to px 0.8")

@@ -269,12 +269,13 @@ def test_what_begins_outside_the_configs_sets_refutes_nothing(case, mutate, tmp_
         case.tubes,
         verdict=("UNSAFE",),
         step=np.array([0]),
+        fraction=np.array([0.0]),
         constraint=("disc",),
         start_lower=np.full((1, 4), -5.0),
         start_upper=np.full((1, 4), 5.0),
     )
     example = Counterexample(
-        reference=0, kind="collision", step=0, constraint="disc", depth=0.4,
+        reference=0, kind="collision", step=0, fraction=0.0, constraint="disc", depth=0.4,
         states=loop.rollout(start, w)[0].detach().numpy(), disturbances=w.numpy(),
     )  # fmt: skip
     path = case.write(tmp_path / "certificate.h5", tubes=tubes, verdict="FALSIFIED", counterexamples=(example,))

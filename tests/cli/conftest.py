@@ -63,6 +63,8 @@ def made_up(monkeypatch, example):
                     record.tubes,
                     verdict=("SAFE" if safe else "MAY_COLLIDE",),
                     step=np.array([-1 if safe else 17]),
+                    fraction=np.array([0.0 if safe else 0.25]),
+                    between="segments",
                     constraint=("" if safe else "lower disc",),
                     constraint_names=("workspace", "lower disc"),
                     clearance=np.array([[1.5, 0.25]]),

@@ -26,10 +26,8 @@ def test_run_makes_everything_in_order_and_ends_with_verdict_certificate_and_fig
     assert result.exit_code == 0, result.stderr
     assert made_up.ran == NAMES
     lines = result.stdout.splitlines()
-    begin = lines.index(
-        "VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, at the samples, a text)"
-    )
-    assert lines[begin + 1] == "  reference 0: SAFE at the samples, keeps 0.25 m from lower disc"
+    begin = lines.index("VERIFIED: 1 of 1 references certified, 4 cells (experiment unicycle_node, K = 5, a text)")
+    assert lines[begin + 1] == "  reference 0: SAFE over the whole of every step, keeps 0.25 m from lower disc"
     # The made-up controls go beyond the robot's limits, and whoever reads the verdict is told.
     assert lines[begin + 2].startswith("  controls: turn_rate asks for ")
     assert lines[begin + 2].endswith(" rad/s, beyond its limits -1.5 to 1.5; the proof holds for actuators that follow")
@@ -113,7 +111,7 @@ def test_the_verdict_is_the_exit_code(sagemp, made_up, verdict, code):
 def test_verify_names_the_step_and_the_obstacle_that_decided(sagemp, made_up):
     made_up.certificate["verdict"] = "UNKNOWN"
     sagemp("run", "--until", "train-tracker")
-    assert "  reference 0: MAY_COLLIDE at step 17 (lower disc)" in sagemp("verify").stdout
+    assert "  reference 0: MAY_COLLIDE at step 17.25, 4.312 s (lower disc)" in sagemp("verify").stdout
 
 
 def test_verify_speaks_json(sagemp, made_up):
@@ -121,8 +119,12 @@ def test_verify_speaks_json(sagemp, made_up):
     found = json.loads(sagemp("verify", "--json").stdout)
     assert (found["verdict"], found["exit_code"], found["from_file"]) == ("VERIFIED", 0, False)
     assert found["references"] == [
-        {"verdict": "SAFE", "step": None, "constraint": "", "clearance": 0.25, "nearest": "lower disc"}
-    ]
+        {
+            "verdict": "SAFE", "step": None, "fraction": None, "time": None, "constraint": "", "clearance": 0.25,
+            "nearest": "lower disc",
+        }
+    ]  # fmt: skip
+    assert (found["between"], found["holds"]) == ("segments", "over the whole of every step")
     assert found["figure"] == f"{FOLDER}/certificate.png"
     assert json.loads(sagemp("verify", "--json").stdout)["from_file"] is True
 

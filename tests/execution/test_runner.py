@@ -161,7 +161,7 @@ def test_an_attack_refutes_what_is_unsafe_and_certified_references_withstand(lib
     assert [str(v.outcome) for v in found.verification.verdicts] == ["SAFE", "UNSAFE"]
     ((index, example),) = found.counterexamples
     assert (index, example.kind, example.name) == (1, "obstacle", "disc")
-    assert found.verification.verdicts[1] == Verdict(Outcome.UNSAFE, example.step, "disc")
+    assert found.verification.verdicts[1] == Verdict(Outcome.UNSAFE, example.step, "disc", example.fraction)
     assert found.rollouts > 0
 
 

@@ -95,7 +95,7 @@ def test_shapes_are_references_by_kinds_of_disturbance_by_rollouts(tracker):
 def test_clearances_are_those_of_the_nearest_rollouts_which_start_in_x_i(tracker):
     found = tried(tracker, plans(0.0, 0.6))
     for trials in (found.open_loop, found.closed_loop):
-        distance = SCENE.signed_distance(trials.nearest).amin(-1)
+        distance = SCENE.signed_distance_along(trials.nearest).amin(-1)
         torch.testing.assert_close(distance, trials.clearance.amin(-1))
         assert START.contains(trials.nearest[..., 0, :]).all()
 

@@ -70,7 +70,13 @@ def test_a_damaged_artifact_is_an_error_not_a_figure(tmp_path, capsys):
 def test_the_title_states_verdict_cells_horizon_and_time(certificate):
     title, subtitle = texts(draw_certificate(certificate))
     assert title.startswith("Certified")
-    for part in ("SAFE at the samples, passes disc at", "4 cells", "K = 25 (2.5 s)", "affine in", "rounding included"):
+    for part in (
+        "SAFE over the whole of every step, passes disc at",
+        "4 cells",
+        "K = 25 (2.5 s)",
+        "affine in",
+        "rounding included",
+    ):
         assert part in subtitle
 
 
@@ -93,7 +99,7 @@ def test_every_figure_of_a_claim_says_that_it_holds_at_the_samples(toy_folder, c
         record = dataclasses.replace(certificate.record, verdict=verdict)
         shown.append(draw_certificate(dataclasses.replace(certificate, record=record)))
     for figure in shown:
-        assert "at the samples" in " ".join(" ".join(texts(figure)).split())
+        assert "over the whole of every step" in " ".join(" ".join(texts(figure)).split())
 
 
 def test_a_tube_that_overflows_is_drawn_up_to_there(certificate, tmp_path):
@@ -125,6 +131,7 @@ def test_a_counterexample_is_drawn(certificate, tmp_path):
         reference=0,
         kind="collision",
         step=9,
+        fraction=0.5,
         constraint="disc",
         depth=0.1,
         states=certificate.record.tubes.references[0],

@@ -5,7 +5,7 @@ import torch
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.scenes import Ball, Block, Scene
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Between, Box, Bulge, Tube
 from sagemp_cli.verification.verdict import Answer, Outcome, Verdict, answer_of, assess, shortfall
 
 NAMES = ("px", "py", "theta")
@@ -23,10 +23,10 @@ def tube(*boxes):
     return Tube(lower[None], upper[None])
 
 
-def judge(t, *owner):
+def judge(t, *owner, **options):
     """Every cell belongs to the reference that is named, by default to one."""
     cells = torch.tensor(owner or [0] * len(t.lower))
-    return assess(t, SCENE, cell_reference=cells, position=(0, 1), state_names=NAMES)
+    return assess(t, SCENE, cell_reference=cells, position=(0, 1), state_names=NAMES, **options)
 
 
 def together(*tubes):
@@ -45,9 +45,11 @@ def test_a_clear_tube_that_ends_in_the_goal_is_safe():
 
 def test_a_tube_that_touches_an_obstacle_is_not_safe():
     touching = (-1.0, 1.0, 3.0, 4.0)
-    assert judge(tube(CLEAR, touching, GOAL)).verdicts == (Verdict(Outcome.MAY_COLLIDE, 1, "disc"),)
+    assert judge(tube(CLEAR, touching, GOAL)).verdicts == (Verdict(Outcome.MAY_COLLIDE, 0, "disc", 7 / 8),)
     beside = (3.0, 4.0, -5.0, -4.5)
-    assert judge(tube(CLEAR, beside, GOAL)).verdicts == (Verdict(Outcome.MAY_COLLIDE, 1, "crate"),)
+    assert judge(tube(CLEAR, beside, GOAL)).verdicts == (Verdict(Outcome.MAY_COLLIDE, 0, "crate", 7 / 8),)
+    at_samples = judge(tube(CLEAR, touching, GOAL), between=Between.SAMPLES)
+    assert at_samples.verdicts == (Verdict(Outcome.MAY_COLLIDE, 1, "disc"),)
     assert judge(tube(CLEAR, (-1.0, 1.0, 3.0, 4.0 - 1e-12), GOAL)).verdicts[0].outcome is Outcome.SAFE
 
 
@@ -55,6 +57,31 @@ def test_the_start_counts_and_the_earliest_step_is_named():
     found = judge(tube((9.5, 10.5, 0.0, 1.0), (-1.0, 1.0, 4.0, 6.0), GOAL))
     assert found.verdicts == (Verdict(Outcome.MAY_COLLIDE, 0, "workspace"),)
     assert str(found.verdicts[0]) == "MAY_COLLIDE at step 0 (workspace)"
+
+
+def test_a_tube_that_passes_an_obstacle_between_two_samples_is_not_safe_and_the_time_is_named():
+    low, high = (-0.1, 0.1, 1.0, 2.0), (-0.1, 0.1, 8.0, 9.0)  # the disc is from 4 to 6
+    found = judge(tube(low, high, GOAL))
+    assert found.verdicts == (Verdict(Outcome.MAY_COLLIDE, 0, "disc", 2 / 8),)  # 2 + 7 * 3/8 > 4
+    assert str(found.verdicts[0]) == "MAY_COLLIDE at step 0.25 (disc)" and found.clearance[0, 1] <= 0
+    assert judge(tube(low, high, GOAL), between=Between.SAMPLES).verdicts[0].outcome is Outcome.SAFE
+    # From one side of the disc to the other, below it: nearer than at both samples.
+    beside = judge(tube((-8.0, -7.0, 2.0, 2.0), (7.0, 8.0, 2.0, 2.0)), between=Between.SEGMENTS)
+    assert 1.9 < float(beside.clearance[0, 1]) <= 2.0 < 6.0
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1.0])
+def test_a_bulge_counts_and_what_is_not_known_of_it_clears_nothing(wrong):
+    t = tube(CLEAR, (2.5, 3.5, 2.0, 3.0), GOAL)
+    none = torch.zeros(1, 2, 3, dtype=torch.float64)
+    assert judge(t, bulge=Bulge(none, none, none)).verdicts[0].outcome is Outcome.SAFE
+    bent = none.clone()
+    bent[0, 1, 0] = 60.0
+    swung = judge(t, bulge=Bulge(bent, bent, none))
+    assert swung.verdicts[0].outcome is Outcome.MAY_COLLIDE and swung.verdicts[0].step == 1
+    assert judge(t, bulge=Bulge(none, none, bent)).verdicts[0].outcome is Outcome.MAY_COLLIDE
+    bent[0, 1, 0] = wrong
+    assert judge(t, bulge=Bulge(none, none, bent)).verdicts[0].outcome is not Outcome.SAFE
 
 
 def test_the_goal_is_closed_and_exact():
@@ -117,7 +144,8 @@ def test_the_shortfall_is_zero_where_a_cell_is_safe_and_grows_with_what_is_missi
 
 def test_cells_that_are_clear_are_safe_although_their_hull_collides():
     left, right = (-4.0, -1.5, 4.0, 6.0), (1.5, 4.0, 4.0, 6.0)
-    assert judge(together(tube(left, GOAL), tube(right, GOAL))).verdicts[0].outcome is Outcome.SAFE
+    tubes = tube(left, (-4.0, -1.5, -1.0, 1.0), GOAL), tube(right, (1.5, 4.0, -1.0, 1.0), GOAL)
+    assert judge(together(*tubes)).verdicts[0].outcome is Outcome.SAFE
 
 
 def test_the_answer_for_all_references():

@@ -16,9 +16,10 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.propagator import Loop
-from sagemp_cli.sets import Box
+from sagemp_cli.scenes.segments import along
+from sagemp_cli.sets import Between, Box
 from sagemp_cli.verification.attack.ascent import ascend, first_units, simulate
-from sagemp_cli.verification.attack.rigorous_replay import inner, violations
+from sagemp_cli.verification.attack.rigorous_replay import Replay, inner
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Counterexample:
         states: the replayed states ``(K+1, n)``, in float64.
         kind: ``"workspace"``, ``"obstacle"`` or ``"goal"``.
         name: the obstacle's name, or the kind again.
-        step: the first step at which the constraint is broken (K for the goal).
+        step: the first step in which the constraint is broken (K for the goal).
+        fraction: of that step, in [0, 1): the earliest time that is known at which it is.
         depth: how far it is broken at worst, metres in the scene, units of the state in the goal.
         state: of a missed goal the state that misses most, else -1.
         proved: whether rigorous arithmetic proves that the constraint is broken at ``step``. If not, the violation may
@@ -47,20 +49,36 @@ class Counterexample:
     depth: float
     state: int = -1
     proved: bool = False
+    fraction: float = 0.0
 
 
 def margins(states: Tensor, problem: Problem) -> Tensor:
     """Signed margins ``(..., K+1, C)`` of states: [workspace, obstacles..., goal], broken if negative.
 
-    The goal counts at step K only; earlier rows are infinite. Round to nearest.
+    Row k is over the whole of the straight line from ``x_k`` to ``x_{k+1}``, or at ``x_k`` alone if the problem asks
+    for the samples only. The goal counts at step K only: all else in its row, and it in all others, is infinite where
+    lines are asked for. Round to nearest.
     """
     scene, p = problem.scene, states[..., list(problem.dynamics.position)]
     inside = torch.minimum(p - scene.workspace.lower, scene.workspace.upper - p).amin(-1)
-    goal = torch.full_like(inside, torch.inf)
+    endless = torch.full_like(inside, torch.inf)
     last = states[..., -1, :]
     reached = torch.minimum(last - scene.goal.lower, scene.goal.upper - last).amin(-1)
-    goal = torch.cat([goal[..., :-1], reached[..., None]], dim=-1)
-    return torch.stack([inside, *(o.signed_distance(p) for o in scene.obstacles), goal], dim=-1)
+    goal = torch.cat([endless[..., :-1], reached[..., None]], dim=-1)
+    if problem.between is Between.SAMPLES:
+        return torch.stack([inside, *(o.signed_distance(p) for o in scene.obstacles), goal], dim=-1)
+    rows = [
+        torch.minimum(inside[..., :-1], inside[..., 1:]),  # the workspace is convex: an end is the worst place
+        *(o.signed_distance(along(p, o.nearest(p))) for o in scene.obstacles),
+    ]
+    return torch.stack([*(torch.cat([row, endless[..., :1]], dim=-1) for row in rows), goal], dim=-1)
+
+
+def worst_fractions(states: Tensor, problem: Problem) -> Tensor:
+    """Where in [0, 1] of each step a rollout ``(K+1, n)`` is worst for each constraint, ``(K, C - 1)``: no goal."""
+    scene, p = problem.scene, states[..., list(problem.dynamics.position)]
+    inside = torch.minimum(p - scene.workspace.lower, scene.workspace.upper - p).amin(-1)
+    return torch.stack([(inside[1:] < inside[:-1]).to(p), *(o.nearest(p) for o in scene.obstacles)], dim=-1)
 
 
 def replay(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Counterexample | None:
@@ -81,7 +99,9 @@ def replay(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) ->
         found = margins(states, problem)
     if not bool(torch.isfinite(states).all()) or not bool((found < 0).any()):
         return None
-    proved = violations(loop, start, disturbances, problem)
+    worst = worst_fractions(states, problem)
+    rigorous = Replay.of(loop, start, disturbances, problem)
+    proved = rigorous.broken(worst)
     certain = bool(proved.any())
     # Of what is proved (of what float64 shows, if nothing is) the constraint that is broken most.
     broken = proved if certain else found < 0
@@ -89,9 +109,15 @@ def replay(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) ->
     names = (*scene.constraint_names, "goal")
     kind = {0: "workspace", len(names) - 1: "goal"}.get(constraint, "obstacle")
     step, depth = int(broken[:, constraint].int().argmax()), -float(found[:, constraint].min())
-    worst = int(torch.minimum(states[-1] - scene.goal.lower, scene.goal.upper - states[-1]).argmin())
-    state = worst if kind == "goal" else -1
-    return Counterexample(start, disturbances, states, kind, names[constraint], step, depth, state, certain)
+    miss = int(torch.minimum(states[-1] - scene.goal.lower, scene.goal.upper - states[-1]).argmin())
+    state, fraction = miss if kind == "goal" else -1, 0.0
+    if kind != "goal" and problem.between is not Between.SAMPLES:
+        fraction = float(worst[step, constraint])
+        if certain:
+            fraction = rigorous.first(step, constraint, fraction)
+        if fraction == 1.0:
+            step, fraction = step + 1, 0.0
+    return Counterexample(start, disturbances, states, kind, names[constraint], step, depth, state, certain, fraction)
 
 
 def _into(box: Box, point: Tensor) -> Tensor:

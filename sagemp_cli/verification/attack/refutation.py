@@ -14,6 +14,7 @@ from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.sets import Box
+from sagemp_cli.sets.between import moment
 from sagemp_cli.verification.attack.falsifier import Counterexample, falsify
 from sagemp_cli.verification.verdict import Outcome, Verdict
 from sagemp_cli.verification.verification import Verification
@@ -110,11 +111,11 @@ def attack(
                         if safe:
                             raise SoundnessError(
                                 f"reference {r} was certified by '{verification.propagator}', but a replayed rollout "
-                                f"breaks '{name}' at step {example.step} by {example.depth:.3g}; "
+                                f"breaks '{name}' at {moment(example.step, example.fraction)} by {example.depth:.3g}; "
                                 "please report this"
                             )
                         found.append((r, example))
-                        verdicts[r] = Verdict(Outcome.UNSAFE, example.step, name)
+                        verdicts[r] = Verdict(Outcome.UNSAFE, example.step, name, example.fraction)
                 task.advance(len(some))
     refuted = dataclasses.replace(verification, verdicts=tuple(verdicts))
     return Refutation(refuted, tuple(found), rollouts, tuple(unproved))

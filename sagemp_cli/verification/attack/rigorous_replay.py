@@ -2,7 +2,8 @@
 
 Far from the origin, and where a claim is missed by a hair, the rounding of a rollout in float64 is larger than the
 violation that it shows. So a rollout refutes a claim only if affine arithmetic, which encloses every rounding error
-and lets the feedback contract it, puts the whole state at some step outside of what is claimed.
+and lets the feedback contract it, puts the whole state at some time outside of what is claimed: at a sample, or at a
+fraction s of a step, where the state is ``(1 - s) x_k + s x_{k+1}``, with s a number that is exact.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from torch import Tensor
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.propagator import Loop
-from sagemp_cli.sets import Box, round_down, round_up
+from sagemp_cli.sets import Between, Box, Tube, round_down, round_up
+from sagemp_cli.sets.between import at_fraction, exact_fraction
 
 
 @dataclass(frozen=True)
@@ -51,30 +53,94 @@ def inner(box: Box) -> Box:
     return Box(torch.where(fits, low, box.lower), torch.where(fits, high, box.upper))
 
 
-def violations(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Tensor:
-    """Which constraint the rollout certainly breaks at which step, ``(K+1, C)``: [workspace, obstacles..., goal].
+@dataclass(frozen=True)
+class Replay:
+    """One rollout enclosed.
 
-    Args:
-        loop: what steps.
-        start: ``(n,)``, in :func:`inner` of X_I. In a dimension so narrow that its inner points are not known the
-            start is anywhere in it.
-        disturbances: ``(K, d)``, in :func:`inner` of W; if W has so narrow a dimension, nothing is certain.
-        problem: what is claimed, with X_I ``(n,)``; the loop may be another one than that of its robot.
+    Attributes:
+        problem: what is claimed, with X_I ``(n,)``.
+        tube: around its states, ``(K+1, n)``; None if nothing is certain of it.
     """
-    scene, around = problem.scene, problem.start
-    loose, loose_w = _unknown(around), _unknown(problem.disturbance)
-    rows, columns = loop.horizon + 1, len(scene.constraint_names) + 1
-    if bool(loose_w.any()):
-        return torch.zeros(rows, columns, dtype=torch.bool)
-    first = Box(torch.where(loose, around.lower, start), torch.where(loose, around.upper, start))
-    still = Box.around([0.0] * problem.disturbance.dim, [0.0] * problem.disturbance.dim)
-    tube = Affine().propagate(OneRollout(loop, disturbances), first, still)
-    position = list(problem.dynamics.position)
-    p = Box(tube.lower[:, position], tube.upper[:, position])
-    outside = ((p.lower > scene.workspace.upper) | (p.upper < scene.workspace.lower)).any(-1)
-    missed = torch.zeros(rows, dtype=torch.bool)
-    missed[-1] = ((tube.lower[-1] > scene.goal.upper) | (tube.upper[-1] < scene.goal.lower)).any()
-    return torch.stack([outside, *(o.occupies(p) for o in scene.obstacles), missed], dim=-1)
+
+    problem: Problem
+    tube: Tube | None
+
+    @classmethod
+    def of(cls, loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Replay:
+        """Of a start and disturbances.
+
+        Args:
+            loop: what steps; may be another one than that of the problem's robot.
+            start: ``(n,)``, in :func:`inner` of X_I. In a dimension so narrow that its inner points are not known the
+                start is anywhere in it.
+            disturbances: ``(K, d)``, in :func:`inner` of W; if W has so narrow a dimension, nothing is certain.
+            problem: what is claimed.
+        """
+        around, loose = problem.start, _unknown(problem.start)
+        if bool(_unknown(problem.disturbance).any()):
+            return cls(problem, None)
+        first = Box(torch.where(loose, around.lower, start), torch.where(loose, around.upper, start))
+        still = Box.around([0.0] * problem.disturbance.dim, [0.0] * problem.disturbance.dim)
+        return cls(problem, Affine().propagate(OneRollout(loop, disturbances), first, still))
+
+    def broken(self, fractions: Tensor) -> Tensor:
+        """Which constraint is certainly broken at which step, ``(K+1, C)``: [workspace, obstacles..., goal].
+
+        Row k is at the given fraction of the line from ``x_k`` to ``x_{k+1}``, or at ``x_k`` if the problem asks for
+        the samples only; nothing but the goal is broken in the last row of lines.
+
+        Args:
+            fractions: where to look, in [0, 1], for each constraint but the goal, ``(K, C - 1)``.
+        """
+        steps, columns = fractions.shape
+        out = torch.zeros(steps + 1, columns + 1, dtype=torch.bool)
+        if self.tube is None:
+            return out
+        goal, tube = self.problem.scene.goal, self.tube
+        out[-1, -1] = ((tube.lower[-1] > goal.upper) | (tube.upper[-1] < goal.lower)).any()
+        places = self._places()
+        for c in range(columns):
+            if self.problem.between is Between.SAMPLES:
+                out[:, c] = self._breaks(c, Box(places.lower, places.upper))
+            else:
+                out[:-1, c] = self._breaks(c, at_fraction(places, exact_fraction(fractions[:, c])))
+        return out
+
+    def first(self, step: int, constraint: int, fraction: float) -> float:
+        """The earliest fraction of a step that is found at which a constraint is certainly broken.
+
+        Along a line an obstacle that is convex, or all that is outside of a workspace that begins inside, is entered
+        once: halving from the begin finds where.
+
+        Args:
+            step, constraint: which :meth:`broken` says is.
+            fraction: at which it is.
+        """
+        places = self._places()
+        line = Tube(places.lower[step : step + 2], places.upper[step : step + 2])
+        begin, end = 0.0, float(exact_fraction(torch.tensor(fraction, dtype=torch.float64)))
+        for s in (begin, *[None] * _HALVINGS):
+            middle = exact_fraction(torch.tensor([0.5 * (begin + end) if s is None else s], dtype=torch.float64))
+            if bool(self._breaks(constraint, at_fraction(line, middle))):
+                end = float(middle)
+            else:
+                begin = float(middle)
+        return end
+
+    def _places(self) -> Tube:
+        assert self.tube is not None
+        index = list(self.problem.dynamics.position)
+        return Tube(self.tube.lower[..., index], self.tube.upper[..., index])
+
+    def _breaks(self, constraint: int, p: Box) -> Tensor:
+        """Whether all of position boxes ``(..., d)`` certainly breaks the workspace (0) or an obstacle (1, ...)."""
+        scene = self.problem.scene
+        if constraint:
+            return scene.obstacles[constraint - 1].occupies(p)
+        return ((p.lower > scene.workspace.upper) | (p.upper < scene.workspace.lower)).any(-1)
+
+
+_HALVINGS = 25
 
 
 def _unknown(box: Box) -> Tensor:

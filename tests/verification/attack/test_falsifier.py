@@ -1,5 +1,6 @@
 """The falsifier finds planted violations, replays them, and stays silent on safe loops."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,11 +14,11 @@ from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.problem import Problem
 from sagemp_cli.scenes.scene import Ball, Scene
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box
 from sagemp_cli.trackers import Tracker
 from sagemp_cli.verification.attack.ascent import simulate
 from sagemp_cli.verification.attack.falsifier import falsify, replay
-from sagemp_cli.verification.attack.rigorous_replay import inner, violations
+from sagemp_cli.verification.attack.rigorous_replay import Replay, inner
 
 INF = float("inf")
 
@@ -52,6 +53,12 @@ def claim(where: Scene, start: Box, disturbance: Box, horizon: int = 10) -> Prob
     return Problem(Point(dt=0.1, **limits), where, start, disturbance, horizon)
 
 
+def violations(loop, x: Tensor, w: Tensor, problem: Problem) -> Tensor:
+    """What is certainly broken at the samples 0 to K - 1, and of the goal at K."""
+    at_samples = torch.zeros(loop.horizon, len(problem.scene.constraint_names), dtype=torch.float64)
+    return Replay.of(loop, x, w, problem).broken(at_samples)
+
+
 START = Box.around([0.0, 0.0], [0.1, 0.1])
 DISTURBANCE = Box.around([0.0, 0.0], [0.02, 0.02])
 
@@ -70,7 +77,7 @@ def test_a_violation_that_only_the_worst_disturbance_reaches_is_found_and_replay
     # At k = 10 the reach set's upper face in y is at 0.3; the ball's lowest point is at 0.295.
     [found] = search(scene(Ball((1.0, 0.795), 0.5, "planted")))
     assert found is not None and found.proved
-    assert (found.kind, found.name, found.step) == ("obstacle", "planted", 10)
+    assert (found.kind, found.name) == ("obstacle", "planted") and 9.7 < found.step + found.fraction <= 10
     assert 0 < found.depth <= 0.0051
     assert bool(START.contains(found.start)) and bool(DISTURBANCE.contains(found.disturbances).all())
     assert torch.equal(simulate(Drift(), found.start, found.disturbances), found.states)
@@ -87,11 +94,25 @@ def test_a_missed_goal_is_found():
     assert found.depth == pytest.approx(0.01, abs=1e-3)
 
 
-def test_leaving_the_workspace_names_the_first_step_outside():
+def test_leaving_the_workspace_names_the_time_when_it_is_left():
     [found] = search(scene(half=0.5), start=Box.around([0.0, 0.0], [0.0, 0.0]))
-    assert found is not None and found.kind == "workspace"
-    assert not bool((found.states[: found.step].abs() > 0.5).any())
-    assert float(found.states[found.step].abs().max()) > 0.5
+    assert found is not None and found.kind == "workspace" and found.proved and 0 < found.fraction < 1
+    before, after = found.states[found.step], found.states[found.step + 1]
+    assert float(before.abs().max()) <= 0.5 < float(after.abs().max())
+    left = before + found.fraction * (after - before)
+    assert 0 < float(left.abs().max()) - 0.5 < 1e-6
+
+
+def test_an_obstacle_that_only_a_line_between_two_samples_touches_is_found_and_when():
+    # Without disturbance the samples are at 0, 0.1, 0.2, ...: this disc lies between two of them.
+    still = Box.around([0.0, 0.0], [0.0, 0.0])
+    problem = claim(scene(Ball((0.55, 0.0), 0.01, "pin")), Box.around([0.0, 0.0], [0.004, 0.004]), still)
+    [found] = falsify(Drift(), problem, generator=torch.Generator().manual_seed(0))
+    assert found is not None and found.proved and (found.kind, found.name, found.step) == ("obstacle", "pin", 5)
+    entered = found.states[5] + found.fraction * (found.states[6] - found.states[5])
+    assert 0 <= 0.01 - float((entered - torch.tensor([0.55, 0.0], dtype=torch.float64)).norm()) < 1e-6
+    samples = dataclasses.replace(problem, between=Between.SAMPLES)
+    assert falsify(Drift(), samples, generator=torch.Generator().manual_seed(0)) == [None]
 
 
 @dataclass(frozen=True)
@@ -199,7 +220,8 @@ def test_a_rollout_that_breaks_nothing_is_no_counterexample():
     x = torch.zeros(2, dtype=torch.float64)
     assert replay(Drift(), x, still, claim(scene(), START, DISTURBANCE)) is None
     found = replay(Drift(), x, still, claim(scene(half=0.45), START, DISTURBANCE))
-    assert found is not None and found.proved and (found.kind, found.step) == ("workspace", 5)
+    assert found is not None and found.proved and (found.kind, found.step) == ("workspace", 4)
+    assert found.fraction == pytest.approx(0.5, abs=1e-6)
 
 
 def test_an_overflowing_rollout_is_no_counterexample():
