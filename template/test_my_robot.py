@@ -41,4 +41,4 @@ def test_the_planner_of_our_own_gives_plans_that_keep_clear():
         horizon=PROBLEM.horizon,
         dt=PROBLEM.dynamics.dt,
     )
-    assert bool((PROBLEM.scene.signed_distance(plans[..., :2]) > 0).all())
+    assert bool((PROBLEM.scene.signed_distance_along(plans[..., :2]) > 0).all())

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.checker.balls import BITS, ctx
+from sagemp_cli.checker.clearance import clearances
+from sagemp_cli.checker.scene import SafeSet
 from sagemp_cli.dynamics.unicycle import Unicycle
 from sagemp_cli.execution import execute_queries, try_references
 from sagemp_cli.library.builder import REFERENCE_COLLIDES, reference_faults
@@ -23,9 +26,10 @@ from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes import Block, Scene
 from sagemp_cli.sets import Between, Box
+from sagemp_cli.stages.prove import prove
 from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
 from sagemp_cli.verification.cells import CellProver
-from sagemp_cli.verification.verdict import Outcome, assess
+from sagemp_cli.verification.verdict import Answer, Outcome, assess
 from sagemp_cli.verification.verification import verify_references
 
 K, WALLS = 12, 100
@@ -170,6 +174,36 @@ def test_safety_rates_count_rollouts_that_drive_through(tracker, walls, referenc
         for way in (tried.open_loop, tried.closed_loop):
             crossed = [crosses(path, wall) for path in way.nearest[0].numpy()]
             assert [not bool(safe) for safe in way.safe[0].all(-1)] == crossed
+
+
+def test_a_certificate_that_calls_a_wall_kept_clear_of_is_not_proved(proved, walls, driven_through):
+    """The checker's own account of the lines, in balls, on the tube and walls alone."""
+    lower, upper = (side[..., :2].numpy() for side in (proved.tube.lower, proved.tube.upper))
+    for wall, crossed in zip(walls, driven_through, strict=True):
+        mapping = {"kind": "block", "name": wall.name, "lower": list(wall.lower), "upper": list(wall.upper)}
+        safe = SafeSet.of({"obstacles": [mapping]})
+        with ctx.workprec(BITS):
+            [distance] = clearances(safe, lower, upper, between="segments", parts=8)
+        assert not (crossed and distance > 0)
+        [mine] = judged(proved, wall).clearance[0, 1:].tolist()
+        assert float(distance) == pytest.approx(mine, abs=1e-12) and mine <= float(distance)
+
+
+def test_a_strangers_loop_that_drives_through_is_not_proved(walls):
+    """The same motion without a robot: straight ahead."""
+
+    def step(x):
+        return x + torch.tensor([0.08, 0.0], dtype=torch.float64)
+
+    start = Box.around([0.0, 0.0], [0.005, 0.005])
+    path = np.array([[0.08 * k, 0.0] for k in range(K + 1)])
+    answers = set()
+    for wall in walls[::8]:
+        scene = {"obstacles": [{"kind": "block", "lower": list(wall.lower), "upper": list(wall.upper)}]}
+        proof = prove(step, start, horizon=K, scene=scene, partitions=1)
+        answers.add(proof.answer)
+        assert proof.answer is not Answer.VERIFIED or not crosses(path, wall)
+    assert answers == {Answer.VERIFIED, Answer.FALSIFIED}
 
 
 def test_the_example_that_was_called_safe_is_not(tracker, reference):

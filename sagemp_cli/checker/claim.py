@@ -36,7 +36,7 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     w_names = disturbance_names(document)
     rows = [
         ("for", f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {document.horizon} steps"),
-        ("between", _between(document)),
+        *([("between", _between(document))] if safe.names else []),
         ("X_I", _box(*sets[0].corners(), names, units)),
         ("W", _box(*sets[1].corners(), w_names, [""] * len(w_names))),
         *[("w enters", text) for text in [_entrance(document)] if text],

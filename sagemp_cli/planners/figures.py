@@ -105,7 +105,7 @@ def _open_loop(
     beside = (plans[:, -1, where] - center)[:, torch.isfinite(center)]
     shares = side_shares(plans, scene=scene, position=position)
     return {
-        "collision-free": float((scene.signed_distance(plans[..., where]) > 0).all(-1).double().mean()),
+        "collision-free": float((scene.signed_distance_along(plans[..., where]) > 0).all(-1).double().mean()),
         "in goal": float(scene.goal.contains(plans[:, -1]).double().mean()),
         "goal error": float(torch.linalg.vector_norm(beside, dim=-1).mean()),
         "start error": start_error,

@@ -50,7 +50,7 @@ def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
         generator=generator,
     )
     position = list(setting.dynamics.position)
-    clear = (setting.scene.signed_distance(references[..., position]) > 0).all(-1).numpy()
+    clear = (setting.scene.signed_distance_along(references[..., position]) > 0).all(-1).numpy()
     reaches = setting.scene.goal.contains(references[:, -1]).numpy()
     paths = references[..., setting.plane].numpy()
     places = references[..., position].numpy()

@@ -19,6 +19,14 @@ def test_of_the_same_config_there_is_no_difference(case, report):
     assert differences(report, case.config) == []
 
 
+def test_a_proof_at_the_samples_alone_covers_no_config(certificate, case, mutate, tmp_path):
+    def change(file):
+        file["data/tubes"].attrs.update(between="samples", parts=1)
+
+    [found] = differences(check(mutate(certificate, tmp_path / "samples.h5", change)), case.config)
+    assert (found.what, found.proved, found.asked, found.covers) == ("between", "samples", "segments", False)
+
+
 ASKED = {
     "X_I": (lambda c: c["start"].update(radius=[0.01, 0.04, 0.0, 0.0]), True),
     "X_I ": (lambda c: c["start"].update(radius=[0.06, 0.04, 0.0, 0.0]), False),

@@ -49,6 +49,15 @@ def test_the_claim_is_there_in_full_with_names_and_units(certificate):
     assert found["step"].startswith("formulas of ") and "cos, sin, product" in found["step"]
 
 
+def test_a_claim_about_the_samples_alone_is_printed_as_one(certificate, mutate, tmp_path):
+    def change(file):
+        file["data/tubes"].attrs.update(between="samples", parts=1)
+
+    path = mutate(certificate, tmp_path / "samples.h5", change)
+    assert "of the time between them NOTHING is claimed" in rows(path)["between"][0]
+    assert check(path).answer == "VERIFIED"  # it is less than what was proved
+
+
 def test_what_is_only_said_stands_apart(certificate):
     document = read_document(certificate)
     lines = claim_lines(document, "this is proved:")

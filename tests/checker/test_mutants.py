@@ -28,7 +28,7 @@ from .conftest import STEP, constants_of, slots_of
 WANTED = {
     "tube": 50, "relaxation": 80, "product": 30, "weight": 50, "reference": 25, "cell": 30, "start": 25,
     "disturbance": 25, "goal": 25, "obstacle": 30, "workspace": 15, "figure": 40, "control": 20, "model": 15,
-    "verdict": 20, "structure": 35, "kept": 15,
+    "verdict": 20, "structure": 35, "kept": 15, "segment": 40, "between": 30,
 }  # fmt: skip
 CLEARLY = 1e-7
 Change = Callable[[h5py.File], None]
@@ -341,10 +341,47 @@ def structure(rng, truth) -> Iterator[Change]:
         ][rng.integers(6)]
 
 
+def segment(rng, truth) -> Iterator[Change]:
+    """An obstacle that a rollout meets between two samples; the file claims no more clearance of it than there is."""
+    paths = np.concatenate([s[..., :2] for s in truth.states])
+    while True:
+        path, k, s = paths[rng.integers(len(paths))], int(rng.integers(8)), float(rng.uniform(0.1, 0.9))
+        p = (1 - s) * path[k] + s * path[k + 1]
+        half, tall = float(10.0 ** rng.uniform(-6, -2.5)), float(rng.uniform(1e-4, 1))
+        number, shape = [
+            (0, {"center": p.tolist(), "radius": half}),
+            (1, {"lower": [p[0] - half, p[1] - tall], "upper": [p[0] + half, p[1] + tall]}),
+        ][rng.integers(2)]
+        shape = {key: np.asarray(v).tolist() for key, v in shape.items()}
+
+        def change(file, number=number, shape=shape):
+            change_config(lambda c: c["scene"]["obstacles"][number].update(shape))(file)
+            put("clearance", (0, 1 + number), -99.0)(file)
+
+        yield change
+
+
+def between(rng, truth) -> Iterator[Change]:
+    """What is claimed of the time between samples, in words and numbers that say nothing, or too much."""
+
+    def said(name, value):
+        return lambda file: file["data/tubes"].attrs.__setitem__(name, value)
+
+    while True:
+        yield [
+            said("between", str(rng.choice(["", "continuous", "Segments", "segment", "always", "samples"]))),
+            said("parts", int(rng.choice([0, -1, -8, 65, 2**40]))),
+            said("parts", 1),  # in one part a step the clearances of the file are not proved
+            lambda file: file["data/tubes"].attrs.__delitem__(str(rng.choice(["between", "parts"]))),
+            put("fraction", (0,), float(rng.choice([0.5, -0.125, 1.0, np.nan, np.inf, 1e-300]))),
+            lambda file: file["data/tubes"].__delitem__("fraction"),
+        ][rng.integers(6)]
+
+
 CLASSES = {
     f.__name__: f
     for f in (tube, relaxation, product, weight, reference, cell, start, disturbance, goal, obstacle, workspace,
-              figure, control, model, structure)
+              figure, control, model, structure, segment, between)
 }  # fmt: skip
 
 

@@ -74,6 +74,25 @@ def test_a_loop_that_breaks_its_claim_is_refuted_and_the_counterexample_is_check
     assert sagemp("check", f"{folder}_alone.h5").exit_code == 10
 
 
+PIN = "obstacles: [{kind: ball, name: pin, center: [0.75, 0.75], radius: 0.01}]"
+
+
+def test_an_obstacle_between_two_samples_counts_unless_the_samples_alone_are_asked_for(sagemp, folder, tmp_path):
+    (tmp_path / f"{folder}.py").write_text("def ahead(x):\n    return x + 0.5 + 0.001 * x.sin()\n")
+    (tmp_path / "pin.yaml").write_text(PIN)
+    given = ("prove", f"{folder}.py:ahead", "--start", "0:0.01,0:0.01", "--horizon", "3", "--scene", "pin.yaml")
+    said = sagemp(*given, "--output", "lines.h5")
+    assert said.exit_code == 10 and "FALSIFIED: UNSAFE at step 1.4" in said.stdout
+    assert sagemp("check", "lines.h5").exit_code == 10
+    said = sagemp(*given, "--output", "samples.h5", "--between", "samples")
+    assert said.exit_code == 0 and "from pin at the samples only" in said.stdout
+    assert "between the samples nothing is claimed" in said.stdout
+    checked = sagemp("check", "samples.h5")
+    assert checked.exit_code == 0 and "of the time between them NOTHING is claimed" in checked.stdout
+    wrong = sagemp(*given, "--output", "no.h5", "--between", "never")
+    assert wrong.exit_code == 2 and "between must be 'segments' or 'samples', found 'never'" in wrong.stderr
+
+
 def test_without_scene_and_goal_the_tube_is_proved(sagemp, folder):
     said = sagemp("prove", f"{folder}.py:step", "--start", START, "--disturbance", W, "--horizon", "6", "--json")
     data = json.loads(said.stdout)
