@@ -32,8 +32,8 @@ class Flow:
         state_lower, state_upper: at the beginning of every part.
         lower, upper: boxes that no solution leaves within the part.
         remainder_lower, remainder_upper: what the Taylor polynomial leaves out lies here.
-        curve: bound of ``h^2 / 2 |y''|`` of the solutions y under a constant disturbance, h the length of a part.
-        drift: how far a solution is from that under its disturbance's mean, but for the integrals of both.
+        curve: bound of ``h^2 / 2 |z''|`` of the solutions z under a constant disturbance, h the length of a part.
+        drift: how far a solution is from that under a mean of its disturbance, but for the integrals of both.
     """
 
     division: Division

@@ -4,9 +4,10 @@
 controls in U and ``r_W`` the radius of W:
 
 - ``X`` contains every solution if ``B + [0, h] (f(X, U) + W)`` lies in X (Picard and Lindelöf's operator).
-- With ``A >= |Df|`` on X and U, ``e >= A (h^2/4 r_W + h e)`` bounds how far a solution under ``w(t)`` is from the one
-  under the mean of w, but for what they differ by because the integrals of both w do.
-- The remainder lies in ``h^{p+1} c_{p+1}(X, U, W) + [-e, e]``.
+- With ``A >= |Df|`` on X and U, ``e >= A (3/4 h^2 r_W + h e)`` bounds, at all times, how far a solution under ``w(t)``
+  is from the one under the mean a of w, but for what they differ by because the integrals of both w do.
+- With ``D`` the width of the bounds of Df, at the end of the part it is at most ``g = D 3/4 h^2 r_W + h A e``.
+- The remainder lies in ``h^{p+1} c_{p+1}(X, U, W) + [-g, g]``.
 
 Everything is for all parts of all periods and cells at once, and rounded outwards.
 """
@@ -62,11 +63,13 @@ def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | 
     given = IntervalForm(w.lower, w.upper)
     (found,) = _outputs(programs.coefficients, inside, given, control)
     second, last = (IntervalForm(found.lower[:, i : i + n], found.upper[:, i : i + n]) for i in (0, (p > 1) * n))
-    drift = _drift(_slopes(programs, inside, control), w.radius, h)
+    slopes = _slopes(programs, inside, control)
+    drift = _drift(slopes, w.radius, h)
+    end = _drift_at_the_end(slopes, w.radius, h, drift)
     power = round_up(torch.tensor(h**p, dtype=torch.float64) * h * (1 + 1e-12)), h**p * h * (1 - 1e-12)
     low, high = _times(last, power[1], float(power[0]))
     curve = round_up(torch.maximum(second.lower.abs(), second.upper.abs()) * (h * h * (1 + 1e-12)))
-    return Enclosure(stay.lower, stay.upper, round_down(low - drift), round_up(high + drift), _number(curve), drift)
+    return Enclosure(stay.lower, stay.upper, round_down(low - end), round_up(high + end), _number(curve), drift)
 
 
 def _number(bound: Tensor) -> Tensor:
@@ -122,8 +125,8 @@ def _widened(state: IntervalForm, after: IntervalForm) -> IntervalForm:
     return IntervalForm(round_down(low - more), round_up(high + more))
 
 
-def _slopes(programs: Expansion, inside: IntervalForm, control: IntervalForm | None) -> Tensor:
-    """``A >= |Df|``, ``(N, n, n)``."""
+def _slopes(programs: Expansion, inside: IntervalForm, control: IntervalForm | None) -> IntervalForm:
+    """Bounds of Df, ``(N, n, n)``."""
     n = inside.lower.shape[-1]
     unit = torch.eye(n, dtype=torch.float64)[:, None]  # directions are a batch in front of the parts
     parts = [side.expand(n, *side.shape) for side in inside.bounds]
@@ -132,19 +135,31 @@ def _slopes(programs: Expansion, inside: IntervalForm, control: IntervalForm | N
         given = [torch.cat([side.expand(n, *side.shape), e], -1) for side, e in zip(control.bounds, given, strict=True)]
     nothing = torch.zeros(n, dtype=torch.float64)
     (slope,) = _outputs(programs.tangent, IntervalForm(*parts), IntervalForm(nothing, nothing), IntervalForm(*given))
-    return torch.maximum(slope.lower.abs(), slope.upper.abs()).permute(1, 2, 0)
+    return IntervalForm(*(side.permute(1, 2, 0) for side in slope.bounds))
 
 
-def _drift(slopes: Tensor, radius: Tensor, h: float) -> Tensor:
-    """``e >= A (h^2/4 r_W + h e)``; infinite where none was found."""
-    more = 1 + 1e-9  # more than all that is rounded here
-    base = (h * h / 4 * more) * radius
+_MORE = 1 + 1e-9
+"""More than all that is rounded in the sums below."""
+
+
+def _largest(slopes: IntervalForm) -> Tensor:
+    return torch.maximum(slopes.lower.abs(), slopes.upper.abs())
+
+
+def _swung(radius: Tensor, h: float) -> Tensor:
+    """``3/4 h^2 r_W``."""
+    return (0.75 * h * h * _MORE) * radius
+
+
+def _drift(slopes: IntervalForm, radius: Tensor, h: float) -> Tensor:
+    """``e >= A (3/4 h^2 r_W + h e)``; infinite where none was found."""
+    most, base = _largest(slopes), _swung(radius, h)
 
     def after(e: Tensor) -> Tensor:
-        return (slopes * (base + h * more * e)[..., None, :]).sum(-1) * more + TINY * (base.amax() > 0)
+        return (most * (base + h * _MORE * e)[..., None, :]).sum(-1) * _MORE + TINY * (base.amax() > 0)
 
-    e = after(torch.zeros(slopes.shape[:-1], dtype=torch.float64))
-    trial, kept = e, torch.zeros(slopes.shape[:-2], dtype=torch.bool)
+    e = after(torch.zeros(most.shape[:-1], dtype=torch.float64))
+    trial, kept = e, torch.zeros(most.shape[:-2], dtype=torch.bool)
     for _ in range(_ROUNDS):
         trial = 1.001 * e
         e = after(trial)
@@ -152,3 +167,10 @@ def _drift(slopes: Tensor, radius: Tensor, h: float) -> Tensor:
         if bool(kept.all()):
             break
     return torch.where(kept[..., None], trial, torch.inf)
+
+
+def _drift_at_the_end(slopes: IntervalForm, radius: Tensor, h: float, drift: Tensor) -> Tensor:
+    """``g = D 3/4 h^2 r_W + h A e``."""
+    moved = (slopes.upper - slopes.lower) * _swung(radius, h)[..., None, :]
+    carried = _largest(slopes) * (h * _MORE * drift)[..., None, :]
+    return _number((moved + carried).sum(-1) * _MORE + TINY)

@@ -1,12 +1,14 @@
 """One period of a sampled loop as a step program: Taylor polynomials of the flow, their remainders a disturbance.
 
-With the control u held, h the length of one of S equal parts of the period and ``w_j`` the mean of w over part j, ::
+With the control u held, h the length of one of S equal parts of the period and ``a_j`` and ``b_j`` means of w over part
+j, weighted towards its beginning and its end, ::
 
-    x_{j+1} = x_j + h c_1 + h^2 c_2 + ... + h^p c_p + r_j
+    x_{j+1} = x_j + h c_1 + h^2 c_2 + ... + h^p c_p + h/2 (b_j - a_j) + r_j
 
-where ``c_1 = f(x_j, u) + w_j, c_2, ...`` are the Taylor coefficients of ``y' = f(y, u) + w_j`` from x_j on. Bounds of
+where ``c_1 = f(x_j, u) + a_j, c_2, ...`` are the Taylor coefficients of ``z' = f(z, u) + a_j`` from x_j on. Bounds of
 ``r_j`` are found in :mod:`~sagemp_cli.reachability.continuous.enclosure`; ``docs/continuous_time.md`` has the proof.
-The step's disturbance is ``(w_1, r_1, ..., w_S, r_S)``; its output ``control`` is u and then ``x_1, ..., x_{S-1}``.
+The step's disturbance is ``(a_1, b_1, r_1, ..., a_S, b_S, r_S)``; its output ``control`` is u and then
+``x_1, ..., x_{S-1}``.
 """
 
 from __future__ import annotations
@@ -68,22 +70,24 @@ def _tangent(rate: Program) -> Program:
 def expansion(loop: SampledLoop, division: Division) -> Expansion:
     """The programs of a loop."""
     n, s, h = loop.state_dim, division.substeps, loop.period / division.substeps
-    out = Writer(n, 2 * n * s, loop.control.numbers)
+    out = Writer(n, 3 * n * s, loop.control.numbers)
     u = None
     inputs = {"state": out.state} | ({} if out.numbers is None else {"numbers": out.numbers})
     if loop.controls:
         u = out.embedded(loop.control, inputs).control
     x, between = out.state, []
     for j in range(s):
-        w, r = (out.pick(out.disturbance, 2 * n * j + n * i, n) for i in range(2))
-        c = state_coefficients(out, loop.rate, x, u, w, division.order)
+        a, b, r = (out.pick(out.disturbance, 3 * n * j + n * i, n) for i in range(3))
+        c = state_coefficients(out, loop.rate, x, u, a, division.order)
         total: int | None = None
         for coefficient in c[:0:-1]:  # Horner's rule
             total = None if total is None else out.scaled(total, h)
             total = (
                 total if coefficient is None else coefficient if total is None else out.of("add", coefficient, total)
             )
-        x = out.of("add", x, r if total is None else out.of("add", out.scaled(total, h), r))
+        turned = out.of("add", out.scaled(out.of("sub", b, a), h / 2), r)
+        assert total is not None  # c_1 holds a
+        x = out.of("add", x, out.of("add", out.scaled(total, h), turned))
         between.append(x)
     watched = [*([] if u is None else [u]), *between[:-1]]
     step = out.finished(next=x, control=out.join(*watched) if watched else None)

@@ -162,7 +162,7 @@ def _attempt(
     s, steps = programs.division.substeps, part.horizon
     guess = guess.expand(2, steps, cells, s, n)
     sides = [
-        torch.cat([side.expand(steps, cells, s, n), g], -1).flatten(-2)
+        torch.cat([*[side.expand(steps, cells, s, n)] * 2, g], -1).flatten(-2)
         for side, g in zip((w.lower, w.upper), guess, strict=True)
     ]
     run = affine.run(part, start, Box(*sides), watch=True, states=states)
