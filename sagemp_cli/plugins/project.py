@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.plugins.loading import load_all
 
@@ -55,6 +53,8 @@ def current_project() -> Project:
     path = conf / FILE
     if not path.is_file():
         return Project(folder, conf)
+    import yaml  # here: whoever bounds a loop of his own has no such file
+
     try:
         said = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:

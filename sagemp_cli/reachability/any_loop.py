@@ -80,7 +80,7 @@ def reach(
     chosen, counts = propagator_of(propagator), counts_of(partitions, start)
     if isinstance(cells_at_once, bool) or not isinstance(cells_at_once, int) or cells_at_once < 1:
         raise UsageError(f"cells_at_once must be a positive integer, found {cells_at_once!r}")
-    seen = observed(step, start, disturbance, horizon, batched=batched)
+    seen = observed(step, start, disturbance, horizon, batched=batched, numbers=True)
     loop, disturbance = seen.loop, seen.disturbance
 
     notes: dict[str, None] = {}

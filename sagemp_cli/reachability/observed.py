@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,9 +24,19 @@ from sagemp_cli.reachability.program.comparing import (
     near_kinks,
 )
 from sagemp_cli.reachability.program.loops import RecordedLoop
-from sagemp_cli.reachability.program.probing import GlobalRandomness, Step, probe, reproduced, steady
+from sagemp_cli.reachability.program.probing import (
+    TOLERANCE,
+    GlobalRandomness,
+    Step,
+    probe,
+    reproduced,
+    steady,
+)
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box, Tube
+
+Points = tuple[Tensor, Tensor]
+"""States ``(B, n)`` and disturbances ``(B, d)``."""
 
 ROLLOUTS = 12
 """Rollouts that are simulated to compare the step with its recorded program and with the tube."""
@@ -39,7 +49,8 @@ class Observed:
     Attributes:
         loop: what a propagator bounds.
         start, disturbance: where the step is used, ``(n,)`` and ``(d,)``.
-        states, disturbances: simulated rollouts, ``(R, K+1, n)`` and ``(R, K, d)``; NaN after an overflow.
+        states, disturbances: rollouts of the programs, ``(R, K+1, n)`` and ``(R, K, d)``; NaN after an overflow.
+        numbered: whether the step is told its number.
     """
 
     loop: RecordedLoop
@@ -48,6 +59,7 @@ class Observed:
     states: Tensor
     disturbances: Tensor
     called: Step
+    numbered: bool
     drawn: GlobalRandomness
 
     def compare(self, cells: Box, tube: Tube) -> None:
@@ -62,10 +74,25 @@ class Observed:
             SagempError: a simulated rollout leaves the tube, which is a bug of ours.
         """
         _compare_at_the_start(self.called, self.loop, cells, self.start, self.disturbance)
-        _compare_on_the_tube(self.called, self.loop, tube, self.disturbance)
+        _compare(self.called, self.loop, self._on_the_tube(tube), numbered=self.numbered)
         steady(self.called, self.states[0, 0], self.disturbances[0, 0])
         self.drawn.refuse()
         _check_inside(tube, self.states)
+
+    def _on_the_tube(self, tube: Tube) -> list[Points]:
+        """The centres and corners of the tube's boxes, of some boxes where there are many."""
+        most, rows = MOST_POINTS[self.called.rowwise], self.loop.horizon
+        bounded = torch.isfinite(tube.lower).all(-1) & torch.isfinite(tube.upper).all(-1)
+        boxes = [Box(tube.lower[k : k + 1], tube.upper[k : k + 1]) for k in range(rows)]
+        if not self.numbered:
+            boxes, bounded = [Box(tube.lower[:-1][bounded[:-1]], tube.upper[:-1][bounded[:-1]])], [True]
+        at_each = max(2, most // len(boxes))
+        return [
+            corners_and_centres(
+                box if bounded[k] else Box(box.lower[:0], box.upper[:0]), self.disturbance, most=at_each
+            )
+            for k, box in enumerate(boxes)
+        ]
 
 
 def observed(
@@ -75,20 +102,29 @@ def observed(
     horizon: int | None,
     *,
     batched: bool | None = None,
+    numbers: bool = False,
 ) -> Observed:
     """A step recorded, after it was called on some states; arguments and errors as of
     :func:`~sagemp_cli.reachability.any_loop.reach`.
+
+    Args:
+        numbers: whether steps that differ in what they add may be one program, with numbers of each step's own.
     """
     check_box("start", start)
-    function, steps, varying = _function(step, start.dim, horizon)
+    function, steps, numbered = _function(step, start.dim, horizon)
     if disturbance is None:
         function, disturbance = _undisturbed(function, step), Box.around([0.0], [0.0])
     check_box("disturbance", disturbance)
     drawn = GlobalRandomness()
     called = probe(function, start, disturbance, batched=batched)
-    states, disturbances = _simulated(called, start, disturbance, steps)
-    loop = _recorded(called, states, disturbances, steps, varying)
-    return Observed(loop, start, disturbance, states, disturbances, called, drawn)
+    x, w = _drawn(start, disturbance, steps)
+    before = called.all(0, x, w[:, 0])
+    loop = called.recorded(x[0], w[0], numbered=numbered, numbers=numbers)
+    reproduced(called, x, w[:, 0], before)
+    states = _rollouts(loop, x, w)
+    points = [_finite(states[:, k], w[:, k]) for k in range(steps)]
+    _compare(called, loop, points, numbered=numbered)
+    return Observed(loop, start, disturbance, states, w, called, numbered, drawn)
 
 
 def _undisturbed(function: Callable[[int, Any, Any], Any], step: Any) -> Callable[[int, Any, Any], Any]:
@@ -124,7 +160,7 @@ def check_box(name: str, box: Any) -> None:
 
 
 def _function(step: Any, n: int, horizon: Any) -> tuple[Callable[[int, Any, Any], Any], int, bool]:
-    """``(k, x, w) -> x_next``, the number of steps, and whether steps differ."""
+    """``(k, x, w) -> x_next``, the number of steps, and whether it is told which."""
     loop: Any = step  # a checker of types takes what has been called callable for a function
     is_loop = not callable(step) and callable(getattr(step, "step", None))
     if not is_loop and not callable(step):
@@ -150,8 +186,8 @@ def _function(step: Any, n: int, horizon: Any) -> tuple[Callable[[int, Any, Any]
     return loop.step, steps, True
 
 
-def _simulated(step: Step, start: Box, disturbance: Box, steps: int) -> tuple[Tensor, Tensor]:
-    """Rollouts ``(R, K+1, n)`` and their disturbances ``(R, K, d)``; NaN after an overflow."""
+def _drawn(start: Box, disturbance: Box, steps: int) -> Points:
+    """Starts ``(R, n)`` and disturbances ``(R, K, d)`` of rollouts: inside, and of every other one at corners."""
     generator = torch.Generator().manual_seed(1)
     x = start.sample(ROLLOUTS, generator)
     corner = torch.rand(x.shape, generator=generator) < 0.5
@@ -159,60 +195,68 @@ def _simulated(step: Step, start: Box, disturbance: Box, steps: int) -> tuple[Te
     w = disturbance.sample(ROLLOUTS * steps, generator).unflatten(0, (ROLLOUTS, steps))
     extreme = torch.where(torch.rand(w.shape, generator=generator) < 0.5, disturbance.lower, disturbance.upper)
     w[::2] = extreme[::2]
-    states = torch.full((ROLLOUTS, steps + 1, start.dim), torch.nan, dtype=torch.float64)
-    states[:, 0] = x
+    return x, w
+
+
+def _rollouts(loop: RecordedLoop, x: Tensor, w: Tensor) -> Tensor:
+    """The states ``(R, K+1, n)`` that the programs go through; NaN after an overflow.
+
+    Those of the step are the same up to rounding, or it is found out where it first does something else.
+    """
+    states = [x]
     with torch.no_grad():
-        for k in range(steps):
-            alive = torch.isfinite(states[:, k]).all(-1)
-            if not bool(alive.any()):
-                break
-            after = step.all(k, states[alive, k], w[alive, k])
-            states[alive, k + 1] = torch.where(torch.isfinite(after).all(-1, keepdim=True), after, torch.nan)
-    return states, w
+        for k in range(loop.horizon):
+            after = loop.step(k, states[-1], w[:, k])
+            known = (torch.isfinite(after) & torch.isfinite(states[-1])).all(-1, keepdim=True)
+            states.append(torch.where(known, after, torch.nan))
+    return torch.stack(states, dim=1)
 
 
-def _recorded(step: Step, states: Tensor, disturbances: Tensor, steps: int, varying: bool) -> RecordedLoop:
-    """The loop as programs that do, on all simulated states, what the step does."""
-    before = step.all(0, states[:, 0], disturbances[:, 0])
-    programs = tuple(step.record(k, states[0, 0], disturbances[0, k]) for k in range(steps if varying else 1))
-    if all(programs[0].same_as(other) for other in programs[1:]):
-        programs, varying = programs[:1], False
-    reproduced(step, states[:, 0], disturbances[:, 0], before)
-    # One comparison for all steps that one program serves.
-    at = [slice(k, k + 1) for k in range(steps)] if varying else [slice(0, steps)]
-    for k, (program, part) in enumerate(zip(programs, at, strict=True)):
-        after = states[:, 1:][:, part].flatten(0, 1)
-        compare(step, k, program, states[:, part].flatten(0, 1), disturbances[:, part].flatten(0, 1), after)
-    return RecordedLoop(programs, torch.zeros(steps, 0, dtype=torch.float64), steps)
+def _finite(x: Tensor, w: Tensor) -> Points:
+    known = torch.isfinite(x).all(-1)
+    return x[known], w[known]
+
+
+@torch.no_grad()
+def _compare(step: Step, loop: RecordedLoop, points: Sequence[Points], *, numbered: bool) -> None:
+    """Compare step and program at points: of each step, if it is told which it is, or all of them together."""
+    most = MOST_POINTS[step.rowwise]
+    programs = loop.programs
+    if not numbered:
+        x, w = (torch.cat(some) for some in zip(*points, strict=True))
+        for some in zip(x.split(most), w.split(most), strict=True):
+            compare(step, 0, programs[0], *some)
+        return
+    if len(programs) > 1:
+        for k, (program, some) in enumerate(zip(programs, points, strict=True)):
+            compare(step, k, program, *some)
+        return
+    after = [step.all(k, x, w) if len(x) else x for k, (x, w) in enumerate(points)]
+    number = torch.arange(len(points)).repeat_interleave(torch.tensor([len(x) for x, _ in points]))
+    together = [*(torch.cat(some) for some in zip(*points, strict=True)), torch.cat(after), number]
+    for x, w, y, k in zip(*(some.split(most) for some in together), strict=True):
+        compare(step, k, loop.program(0), x, w, y, loop.numbers[k])
 
 
 def _compare_at_the_start(step: Step, loop: RecordedLoop, cells: Box, start: Box, disturbance: Box) -> None:
     """Compare step and program where they may differ: cells' corners and centres, thresholds, along the gradient."""
-    program = loop.programs[0]
-    compare(step, 0, program, *corners_and_centres(cells, disturbance, most=MOST_POINTS[step.rowwise]))
-    compare(step, 0, program, *near_kinks(program, start, disturbance))
-    points = climbed(step, program, start, disturbance)
-    if points is not None:
-        compare(step, 0, program, *points)
-
-
-def _compare_on_the_tube(step: Step, loop: RecordedLoop, tube: Tube, disturbance: Box) -> None:
-    """Compare step and program at the centres and at corners of the tube's boxes."""
-    most = MOST_POINTS[step.rowwise]
-    bounded = torch.isfinite(tube.lower).all(-1) & torch.isfinite(tube.upper).all(-1)
-    if len(loop.programs) == 1:
-        boxes = Box(tube.lower[:-1][bounded[:-1]], tube.upper[:-1][bounded[:-1]])
-        compare(step, 0, loop.programs[0], *corners_and_centres(boxes, disturbance, most=most))
-        return
-    for k, program in enumerate(loop.programs):
-        if bool(bounded[k]):
-            box = Box(tube.lower[k : k + 1], tube.upper[k : k + 1])
-            compare(step, k, program, *corners_and_centres(box, disturbance, most=max(2, most // loop.horizon)))
+    program, numbers = loop.programs[0], loop.numbers[0]
+    found = [
+        corners_and_centres(cells, disturbance, most=MOST_POINTS[step.rowwise]),
+        near_kinks(program, numbers, start, disturbance),
+        climbed(step, program, numbers, start, disturbance),
+    ]
+    for points in found:
+        compare(step, 0, program, *points, numbers=numbers)
 
 
 def _check_inside(tube: Tube, states: Tensor) -> None:
-    """Refuse to return a tube that a simulated rollout leaves; rounding of the simulation is forgiven."""
-    slack = 1e-9 * (1.0 + states.abs())
+    """Refuse to return a tube that a simulated rollout leaves.
+
+    A rollout in floats has roundings of its own, which the loop carries on and no tube encloses. What two evaluations
+    of the same formulas may differ by is forgiven, as wherever the two are compared without an account of rounding.
+    """
+    slack = TOLERANCE * (1.0 + states.abs())
     out = (states < tube.lower - slack) | (states > tube.upper + slack)
     if bool(out.any()):
         _, k, i = torch.nonzero(out)[0].tolist()

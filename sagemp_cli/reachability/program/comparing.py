@@ -29,36 +29,50 @@ _KINKS, _STARTS, _NEWTON = 32, 4, 4
 _AROUND = (0.0, 1e-3, -1e-3, 0.1, -0.1, 1.0, -1.0)
 
 
-def compare(step: Step, k: int, program: Program, x: Tensor, w: Tensor, after: Tensor | None = None) -> None:
+def compare(
+    step: Step,
+    k: int | Tensor,
+    program: Program,
+    x: Tensor,
+    w: Tensor,
+    after: Tensor | None = None,
+    numbers: Tensor | None = None,
+) -> None:
     """Refuse a step that differs from its program at states ``(B, n)`` and disturbances ``(B, d)``.
 
     Where there are more points than :data:`MOST_POINTS`, every so many is taken. Points where the step gives no finite
     result are left out; where the interval is infinite, a relative tolerance of 1e-9 stands in.
 
     Args:
+        k: number of the step; one for each point where the next states are known.
         after: the next states, if they are known.
+        numbers: that the program has at this step, ``(g,)``, or at each point's, ``(B, g)``.
     """
     if not len(x):
         return
+    ks = torch.as_tensor(k).expand(len(x))
+    own = torch.zeros(0, dtype=torch.float64) if numbers is None else numbers
+    own = own.expand(len(x), -1)
     if after is None:
         every = max(1, -(-len(x) // MOST_POINTS[step.rowwise]))
-        x, w = x[::every], w[::every]
+        x, w, own, ks = x[::every], w[::every], own[::every], ks[::every]
         with torch.no_grad():
-            after = step.all(k, x, w)
+            after = step.all(int(ks[0]), x, w)
     known = torch.isfinite(after).all(-1)
-    x, w, after = x[known], w[known], after[known]
+    x, w, after, own, ks = x[known], w[known], after[known], own[known], ks[known]
     if not len(x):
         return
     with torch.no_grad():
-        low, high = program.run(IntervalForm(x, x), IntervalForm(w, w), evaluate=evaluate).next.bounds
+        low, high = program.run(*(IntervalForm(v, v) for v in (x, w, own)), evaluate=evaluate).next.bounds
         slack = ROUNDINGS * ((high - low) + 2.0**-52 * after.abs())
         off = (after < low - slack) | (after > high + slack)
         loose = ~torch.isfinite(slack)
         if bool(loose.any()):
-            plain = program.run(x, w).next.expand(after.shape)
+            plain = program.run(x, w, own).next.expand(after.shape)
             off = torch.where(loose, ~((after - plain).abs() <= TOLERANCE * (1.0 + after.abs())), off)
     if bool(off.any()):
         row, i = torch.nonzero(off)[0].tolist()
+        k = int(ks[row])
         if step.rowwise and not step.batched:
             with torch.no_grad():
                 alone = step.at(k, x[row], w[row])
@@ -110,7 +124,7 @@ def _gaps(i: Instruction, values: Sequence[Tensor]) -> list[Tensor]:
     return [values[0][..., finite] - limit[finite] for limit in limits if (finite := torch.isfinite(limit)).any()]
 
 
-def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
+def near_kinks(program: Program, numbers: Tensor, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
     """Points ``(B, n)``, ``(B, d)`` of the boxes at and beside the thresholds of the program's clamps, relus and so on.
 
     Newton's method on the distance to each threshold (at most 32, from 4 points each) finds them.
@@ -126,7 +140,8 @@ def near_kinks(program: Program, start: Box, disturbance: Box) -> tuple[Tensor, 
             return i.on(*values)
 
         with torch.enable_grad():
-            program.run(*z.split(sizes, dim=-1), evaluate=noted)
+            x, w = z.split(sizes, dim=-1)
+            program.run(x, w, numbers, evaluate=noted)
         return torch.cat(found, -1) if found else None
 
     z = both.sample(_STARTS, torch.Generator().manual_seed(3)).requires_grad_(True)
@@ -153,8 +168,8 @@ def _inside(z: Tensor, box: Box) -> Tensor:
     return torch.nan_to_num(torch.minimum(torch.maximum(z, box.lower), box.upper))
 
 
-def climbed(step: Step, program: Program, start: Box, disturbance: Box) -> tuple[Tensor, Tensor] | None:
-    """Points reached by gradient ascent on the difference of step and program; None if the step has no gradient."""
+def climbed(step: Step, program: Program, numbers: Tensor, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
+    """Points reached by gradient ascent on the difference of step and program; none if the step has no gradient."""
     both = Box(torch.cat([start.lower, disturbance.lower]), torch.cat([start.upper, disturbance.upper]))
     sizes = [start.dim, disturbance.dim]
     z = both.sample(16 if step.rowwise else 4, torch.Generator().manual_seed(4))
@@ -163,10 +178,11 @@ def climbed(step: Step, program: Program, start: Box, disturbance: Box) -> tuple
         z = z.detach().requires_grad_(True)
         try:
             with torch.enable_grad():
-                difference = step.differentiable(0, *z.split(sizes, dim=-1)) - program.run(*z.split(sizes, dim=-1)).next
+                x, w = z.split(sizes, dim=-1)
+                difference = step.differentiable(0, x, w) - program.run(x, w, numbers).next
                 (slope,) = torch.autograd.grad(difference.square().sum(), z)
         except (RuntimeError, UsageError):
-            return None
+            return torch.zeros(0, sizes[0], dtype=torch.float64), torch.zeros(0, sizes[1], dtype=torch.float64)
         z = _inside(z.detach() + 0.25 * both.width * torch.sign(torch.nan_to_num(slope)), both)
         visited.append(z)
     x, w = torch.cat(visited).split(sizes, dim=-1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeGuard
@@ -9,9 +11,11 @@ from typing import Any, Protocol, TypeGuard
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import UsageError
+from sagemp_cli.errors import SagempError, UsageError
+from sagemp_cli.reachability.program.numbers import numbers_are_added
 from sagemp_cli.reachability.program.program import Outputs, Program
 from sagemp_cli.reachability.program.recorder import Recorder
+from sagemp_cli.reachability.program.tape import Place, Tape
 from sagemp_cli.reachability.program.value import Traced, exact
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
@@ -85,10 +89,7 @@ def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
         example = numbers.flatten(0, -2)[0]
         program = record(lambda x, w, numbers: says.step_given(numbers, x, w), x, w, example)
         return RecordedLoop((program,), numbers, steps)
-    programs = [record(lambda x, w, k=k: loop.step(k, x, w), x, w) for k in range(steps)]
-    if all(programs[0].same_as(other) for other in programs[1:]):
-        programs = programs[:1]
-    return RecordedLoop(tuple(programs), torch.zeros(steps, 0, dtype=torch.float64), steps)
+    return recorded_steps(loop.step, x, w.expand(steps, -1))
 
 
 class _SaysItsSteps(Protocol):
@@ -108,6 +109,69 @@ def _says_its_steps(loop: Any) -> TypeGuard[_SaysItsSteps]:
     return not any(name in vars(kind) for kind in kinds[:last] for name in ("step", "control"))
 
 
+def recorded_steps(
+    call: Callable[[int, Any, Any], Any],
+    state: Tensor,
+    disturbances: Tensor,
+    *,
+    batched: bool = False,
+    numbers: bool = True,
+) -> RecordedLoop:
+    """Steps as one program where they are one, else as one each.
+
+    Args:
+        call: ``(k, x, w)``, otherwise as of :func:`record`.
+        state: of the example, ``(n,)``.
+        disturbances: of the example, for each step, ``(K, d)``.
+        batched: see :func:`record`.
+        numbers: whether steps that differ in what they add may be one program, with numbers of each step's own.
+    """
+    one = _as_one(call, state, disturbances, batched=batched, numbers=numbers)
+    if one is not None:
+        return one
+    programs = [record(functools.partial(call, k), state, w, batched=batched) for k, w in enumerate(disturbances)]
+    if all(programs[0].same_as(other) for other in programs[1:]):
+        programs = programs[:1]
+    steps = len(disturbances)
+    return RecordedLoop(tuple(programs), torch.zeros(steps, 0, dtype=torch.float64), steps)
+
+
+def _as_one(
+    call: Callable[[int, Any, Any], Any], state: Tensor, disturbances: Tensor, *, batched: bool, numbers: bool
+) -> RecordedLoop | None:
+    """The first step recorded, and the others told again on its :class:`Tape`; None where they may differ."""
+    if torch.is_grad_enabled():  # a tape has copies of constants, and a tube may be differentiated by these
+        return None
+    steps, disturbance = len(disturbances), disturbances[0]
+    tape = Tape(Traced)
+    program = record(functools.partial(call, 0), state, disturbance, batched=batched, tape=tape)
+    others: list[dict[Place, Any]] = [{}]
+    for k in range(1, steps):
+        found = tape.again(functools.partial(call, k))
+        if found is None or (found and not numbers):
+            return None
+        others.append(found)
+    places = sorted({place for found in others for place in found})
+    if not places:
+        return RecordedLoop((program,), torch.zeros(steps, 0, dtype=torch.float64), steps)
+    try:
+        columns = [
+            torch.stack([exact(found.get(place, tape.constant(place)), operation="add").clone() for found in others])
+            for place in places
+        ]
+        sizes = [0, *itertools.accumulate(column[0].numel() for column in columns)]
+        where = {
+            place: (slice(first, last), column.shape[1:])
+            for place, column, (first, last) in zip(places, columns, itertools.pairwise(sizes), strict=True)
+        }
+        own = torch.cat([column.reshape(steps, -1) for column in columns], dim=1)
+        tape = Tape(Traced, where)
+        program = record(functools.partial(call, 0), state, disturbance, own[0], batched=batched, tape=tape)
+    except SagempError:  # the steps one by one say what is wrong
+        return None
+    return RecordedLoop((program,), own, steps) if numbers_are_added(program) else None
+
+
 def record(
     call: Callable[..., Any],
     state: Tensor,
@@ -115,6 +179,7 @@ def record(
     numbers: Tensor | None = None,
     *,
     batched: bool = False,
+    tape: Tape | None = None,
 ) -> Program:
     """The program of one call.
 
@@ -123,11 +188,12 @@ def record(
             the next state, or next state, control and deviation, the last two or one of which may be missing or None.
         state, disturbance, numbers: an example, ``(n,)``, ``(d,)``, ``(g,)``.
         batched: whether the call takes batches, and gets batches of one.
+        tape: what to keep the recording on. The call gets no numbers then: they are where the tape has places for them.
     """
     recorder = Recorder(state, disturbance, torch.zeros(0, dtype=torch.float64) if numbers is None else numbers)
-    ids = [recorder.state, recorder.disturbance, *([] if numbers is None else [recorder.numbers])]
+    ids = [recorder.state, recorder.disturbance, *([] if numbers is None or tape else [recorder.numbers])]
     inputs = [Traced(recorder, i[None].clone() if batched else i.clone()) for i in ids]
-    result = call(*inputs)
+    result = call(*inputs) if tape is None else tape.run(call, *inputs)
     if recorder.refusal is not None:
         raise recorder.refusal
     parts = dict(

@@ -7,6 +7,7 @@ call (:mod:`sagemp_cli.reachability.program.value`); the calls made here test th
 from __future__ import annotations
 
 import contextlib
+import functools
 import random
 import sys
 import time
@@ -19,16 +20,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import get_default_nowrap_functions
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
-from sagemp_cli.reachability.program.loops import check_state, record
+from sagemp_cli.reachability.program.loops import RecordedLoop, check_state, record, recorded_steps
 from sagemp_cli.reachability.program.memory import widened
-from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.program.value import UFUNCS, Traced
 from sagemp_cli.sets import Box
 
 TOLERANCE = 1e-9
 """How far two float64 evaluations of the same formulas may differ, relative to 1 plus the size of the result."""
+
+
+_NOT_WRAPPED = get_default_nowrap_functions()
 
 
 class _Exact(Tensor):
@@ -48,7 +52,18 @@ class _Exact(Tensor):
         with torch._C.DisableTorchFunctionSubclass():
             args = widened(tuple(args))
             kwargs = {key: widened(value) for key, value in (kwargs or {}).items()}
+            if types == (cls,):  # what torch itself does then, without its detours
+                result = function(*args, **kwargs)
+                return result if function in _NOT_WRAPPED else cls._wrapped(result)
         return super().__torch_function__(function, types, args, kwargs)
+
+    @classmethod
+    def _wrapped(cls, result: Any) -> Any:
+        if isinstance(result, Tensor):
+            return result if isinstance(result, cls) else result.as_subclass(cls)
+        if isinstance(result, (list, tuple)):
+            return type(result)(cls._wrapped(one) for one in result)
+        return result
 
 
 @dataclass(frozen=True)
@@ -87,10 +102,19 @@ class Step:
             x, w = x[None], w[None]
         return self._plain(self._called(k, x, w), x.shape).reshape(-1)
 
-    def record(self, k: int, x: Tensor, w: Tensor) -> Program:
-        """The program of step k, recorded at one state and disturbance."""
-        with torch.no_grad():
-            return record(lambda x, w: self._stepped(k, x, w), x, w, batched=self.batched)
+    @torch.no_grad()
+    def recorded(self, x: Tensor, w: Tensor, *, numbered: bool, numbers: bool) -> RecordedLoop:
+        """The loop of K steps, recorded at one state ``(n,)`` and disturbances ``(K, d)``.
+
+        Args:
+            x, w: the example.
+            numbered: whether steps may differ: whether the function uses ``k``.
+            numbers: whether steps that differ in what they add may be one program with numbers.
+        """
+        if numbered:
+            return recorded_steps(self._stepped, x, w, batched=self.batched, numbers=numbers)
+        program = record(functools.partial(self._stepped, 0), x, w[0], batched=self.batched)
+        return RecordedLoop((program,), torch.zeros(len(w), 0, dtype=torch.float64), len(w))
 
     def _stepped(self, k: int, x: Any, w: Any) -> Any:
         result = self._called(k, x, w)

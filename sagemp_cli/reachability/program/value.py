@@ -22,6 +22,7 @@ from torch import Tensor
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.program.memory import Example
 from sagemp_cli.reachability.program.recorder import Recorder
+from sagemp_cli.reachability.program.tape import asked
 
 _CLAMPS = ("clamp", "clip", "clamp_min", "clamp_max", "maximum", "minimum", "fmax", "fmin", "max", "min", "hardtanh")
 """Functions whose limits may be infinite."""
@@ -105,9 +106,9 @@ class Traced(Tensor):
         device = property(lambda self: self.ids.device)
         layout = property(lambda self: torch.strided)
         requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
-        data = property(lambda self: self._like(self.ids))
-        T = property(lambda self: self._like(self.ids.T))
-        mT = property(lambda self: self._like(self.ids.mT))
+        data = property(lambda self: self._moved("data", lambda ids: ids))
+        T = property(lambda self: self._moved("T", lambda ids: ids.T))
+        mT = property(lambda self: self._moved("mT", lambda ids: ids.mT))
 
     def dim(self) -> int:
         """Number of dimensions."""
@@ -144,19 +145,22 @@ class Traced(Tensor):
         return len(self.ids) if self.ids.dim() else self._number()
 
     def __iter__(self) -> Iterator[Traced]:
-        return iter([self._like(part) for part in self.ids])
+        return iter(asked("iter", (self,), {}, lambda value: [value._like(part) for part in value.ids]))
 
     def __copy__(self) -> Traced:
-        return self._like(self.ids)
+        return self._moved("copy", lambda ids: ids)
 
     def __deepcopy__(self, memo: Any) -> Traced:
-        return self._like(copy.deepcopy(self.ids, memo))
+        return self._moved("deepcopy", lambda ids: copy.deepcopy(ids, memo))
 
     def __repr__(self, *, tensor_contents: Any = None) -> str:
         return f"Traced(shape={tuple(self.shape)})"
 
     def _like(self, ids: Tensor) -> Traced:
         return Traced(self.recorder, ids)
+
+    def _moved(self, name: str, ids: Callable[[Tensor], Tensor]) -> Traced:
+        return asked(name, (self,), {}, lambda value: value._like(ids(value.ids)))
 
     def _refuse(self, words: str) -> Any:
         error = UnsupportedOperationError(words)
@@ -167,11 +171,11 @@ class Traced(Tensor):
 
     def __getitem__(self, index: Any) -> Traced:
         refuse_traced_index(index)
-        return self._like(self.ids[index])
+        return asked("entries", (self, index), {}, lambda value, index: value._like(value.ids[index]))
 
     def __setitem__(self, index: Any, value: Any) -> None:
         refuse_traced_index(index)
-        self.ids[index] = ids_of(self.recorder, value, "assignment")
+        asked("assignment", (self, index, value), {}, _assign)
 
     # -- what a set does not have -------------------------------------------------------------------------------------
 
@@ -291,7 +295,15 @@ def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     return register
 
 
+def _assign(value: Traced, index: Any, part: Any) -> None:
+    value.ids[index] = ids_of(value.recorder, part, "assignment")
+
+
 def _dispatch(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    return asked(function, args, kwargs, lambda *args: _done(function, args, kwargs))
+
+
+def _done(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     try:
         return _answered(function, args, kwargs)
     except SagempError as error:
