@@ -36,6 +36,8 @@ def require_sound_config(config: Mapping[str, Any], *, problem: bool = True) -> 
     found += source_complaints(config)
     if problem and not any(complaint.startswith("dynamics") for complaint in found):
         found += _problem_complaints(config)
+    root = next((f".{complaint}" for complaint in found if complaint.startswith("seed ")), None)
+    found = [c for c in found if root is None or not c.endswith(root)]  # seeds of stages are the root's by default
     if found:
         raise ConfigError("; ".join(dict.fromkeys(found)))
 

@@ -1,4 +1,4 @@
-"""Verifications to the record that certificates and libraries store, and back."""
+"""Verifications to the records that certificates and libraries store, and back."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import torch
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import PARTS, Between, Box, Tube
-from sagemp_cli.storage import Relaxations, Tubes
+from sagemp_cli.storage import Counterexample, Relaxations, Tubes
+from sagemp_cli.verification.attack.falsifier import Counterexample as Found
 from sagemp_cli.verification.verdict import Outcome, Verdict
 from sagemp_cli.verification.verification import Verification
 
@@ -94,4 +95,18 @@ def verification_of(record: Tubes, where: str) -> Verification:
         rigorous=bool(record.rigorous),
         recording=None,
         between=Between(record.between),
+    )
+
+
+def counterexample_record(reference: int, found: Found, constraint: str) -> Counterexample:
+    """A counterexample of a reference, which breaks this constraint, as stored; an obstacle is a 'collision' there."""
+    return Counterexample(
+        reference=reference,
+        kind="collision" if found.kind == "obstacle" else found.kind,
+        step=found.step,
+        fraction=found.fraction,
+        constraint=constraint,
+        depth=found.depth,
+        states=found.states.numpy(),
+        disturbances=found.disturbances.numpy(),
     )

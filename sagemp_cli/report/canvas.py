@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 
-from sagemp_cli.config.binding import build
-from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.pipeline.models import stand_in
-from sagemp_cli.scenes import Ball, Scene, scene_from_mapping
-from sagemp_cli.sets import Box
+from sagemp_cli.problem import Problem
+from sagemp_cli.scenes import Ball
 from sagemp_cli.storage import Counterexample, Header
 
 INK = "#1f2a37"
@@ -50,30 +47,14 @@ VERDICT_COLOURS = {
 }
 
 
-@dataclass(frozen=True)
-class Setting:
-    """Robot, scene and start box of an artifact, built from the config that it carries."""
+def plane_of(problem: Problem) -> list[int]:
+    """The two states that a map of the workspace shows: the first two of the position."""
+    return list(problem.dynamics.position[:2])
 
-    dynamics: Dynamics
-    scene: Scene
-    start: Box
 
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Setting:
-        """From an artifact's config."""
-        dynamics = build(config["dynamics"], "dynamics")
-        n, d = dynamics.state_dim, len(dynamics.position)
-        scene = scene_from_mapping(config["scene"], state_dim=n, position_dim=d)
-        return cls(dynamics, scene, Box.around(config["start"]["center"], config["start"]["radius"]))
-
-    @property
-    def plane(self) -> list[int]:
-        """The two states that a map of the workspace shows: the first two of the position."""
-        return list(self.dynamics.position[:2])
-
-    def label(self, state: int) -> str:
-        """Axis label of a state, with its unit."""
-        return f"{self.dynamics.state_names[state]} ({unit_text(self.dynamics.state_units[state])})"
+def state_label(problem: Problem, state: int) -> str:
+    """Axis label of a state, with its unit."""
+    return f"{problem.dynamics.state_names[state]} ({unit_text(problem.dynamics.state_units[state])})"
 
 
 def unit_text(unit: str, *, per_second: bool = False) -> str:
@@ -128,13 +109,13 @@ def style_axes(axes: Axes, *, xlabel: str = "", ylabel: str = "", title: str = "
         axes.set_title(title, fontsize=10, color=INK, loc="left")
 
 
-def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
+def draw_scene(axes: Axes, problem: Problem, *, names: bool = True) -> None:
     """Workspace, obstacles, landmarks (dashed) and goal to scale; a three-dimensional scene is seen from above."""
-    if len(setting.dynamics.position) == 3:
+    if len(problem.dynamics.position) == 3:
         axes.annotate("seen from above", (0, 1), (2, 4), "axes fraction", "offset points", fontsize=8.5, color=MUTED)
-    scene, (i, j) = setting.scene, setting.plane
+    scene, (i, j) = problem.scene, plane_of(problem)
     low, high = scene.workspace.lower.tolist(), scene.workspace.upper.tolist()
-    style_axes(axes, xlabel=setting.label(i), ylabel=setting.label(j))
+    style_axes(axes, xlabel=state_label(problem, i), ylabel=state_label(problem, j))
     axes.set_aspect("equal")
     pad = 0.015 * max(high[0] - low[0], high[1] - low[1])
     axes.set_xlim(low[0] - pad, high[0] + pad)
@@ -166,9 +147,9 @@ def draw_scene(axes: Axes, setting: Setting, *, names: bool = True) -> None:
         _name(axes, "goal", at, (0, 4), ha="center", fontsize=8.5, color=GOAL, fontweight="bold")
 
 
-def draw_start(axes: Axes, setting: Setting) -> None:
+def draw_start(axes: Axes, problem: Problem) -> None:
     """The outline of X_I."""
-    low, high = setting.start.lower[setting.plane].tolist(), setting.start.upper[setting.plane].tolist()
+    low, high = problem.start.lower[plane_of(problem)].tolist(), problem.start.upper[plane_of(problem)].tolist()
     axes.add_patch(_box(low, high, fill=False, edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)), zorder=7.5))
     _name(axes, "X$_I$", (low[0], high[1]), (2, 5), fontsize=9, color=INK)
 
@@ -187,10 +168,10 @@ def draw_boxes(axes: Axes, lower: np.ndarray, upper: np.ndarray, **options: Any)
     axes.add_collection(PolyCollection(list(corners), **options), autolim=False)
 
 
-def shown_steps(setting: Setting, lower: np.ndarray, upper: np.ndarray) -> int:
+def shown_steps(problem: Problem, lower: np.ndarray, upper: np.ndarray) -> int:
     """How many steps of tubes ``(cells, K+1, n)`` can be drawn: up to the first that is wider than the workspace."""
-    size = (setting.scene.workspace.upper - setting.scene.workspace.lower).numpy()
-    position = list(setting.dynamics.position)
+    size = (problem.scene.workspace.upper - problem.scene.workspace.lower).numpy()
+    position = list(problem.dynamics.position)
     with np.errstate(invalid="ignore", over="ignore"):
         fits = np.asarray((upper[..., position] - lower[..., position] <= size).all(-1).all(0))
     return len(fits) if fits.all() else int(fits.argmin())
@@ -224,9 +205,9 @@ def time_bar(figure: Figure, axes: Axes | Sequence[Axes], seconds: float) -> Non
     bar.set_label("tube: where the robot can be at time (s)", fontsize=9.5, color=INK)
 
 
-def goal_at_end(axes: Axes, setting: Setting, state: int, end: float) -> None:
+def goal_at_end(axes: Axes, problem: Problem, state: int, end: float) -> None:
     """The goal's faces in one state as a bracket at the end of the time axis."""
-    low, high = float(setting.scene.goal.lower[state]), float(setting.scene.goal.upper[state])
+    low, high = float(problem.scene.goal.lower[state]), float(problem.scene.goal.upper[state])
     if np.isfinite(low) or np.isfinite(high):
         bottom, top = axes.get_ylim()
         low, high = max(low, bottom), min(high, top)

@@ -12,6 +12,8 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
 
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.problem import Problem
 from sagemp_cli.report.canvas import (
     DANGER,
     GOAL,
@@ -21,7 +23,6 @@ from sagemp_cli.report.canvas import (
     REFERENCE,
     UNKNOWN,
     VERDICT_COLOURS,
-    Setting,
     blank_figure,
     broken_at,
     draw_boxes,
@@ -29,7 +30,9 @@ from sagemp_cli.report.canvas import (
     goal_at_end,
     headline,
     legend_above,
+    plane_of,
     shown_steps,
+    state_label,
     style_axes,
     subject,
     time_bar,
@@ -49,8 +52,8 @@ _SAYS = {
 
 def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     """Tube to scale on the left; states with their bounds, and the certified clearance, over time on the right."""
-    record, setting = artifact.record, Setting.of(artifact.header.config)
-    tubes, dynamics = record.tubes, setting.dynamics
+    record, problem = artifact.record, problem_of(artifact.header.config)
+    tubes, dynamics = record.tubes, problem.dynamics
     count, horizon = len(tubes.verdict), tubes.tube_lower.shape[1] - 1
     shown, flat = list(range(dynamics.state_dim)), len(dynamics.position) == 2
     columns = 1 if dynamics.state_dim <= 8 else 2
@@ -58,14 +61,14 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     figure = blank_figure(12 + 2.2 * columns, max(7.2, 1.4 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
 
-    scene = figure.add_subplot(grid[:, 0]) if flat else space_axes(figure, grid[:, 0], setting)
+    scene = figure.add_subplot(grid[:, 0]) if flat else space_axes(figure, grid[:, 0], problem)
     if flat:
-        draw_scene(scene, setting)
+        draw_scene(scene, problem)
     for r in range(count):
         if isinstance(scene, Axes3D):
-            space_tube(scene, setting, tubes, r)
+            space_tube(scene, problem, tubes, r)
         else:
-            draw_tube(scene, setting, tubes, r)
+            draw_tube(scene, problem, tubes, r)
     for example in record.counterexamples:
         path = example.states[:, list(dynamics.position)]
         scene.plot(*path.T, color=DANGER, linewidth=1.6, zorder=8)
@@ -86,20 +89,20 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
         axes = figure.add_subplot(grid[place % rows, 1 + place // rows], sharex=panels[0] if panels else None)
         panels.append(axes)
         last = place % rows == rows - 1
-        style_axes(axes, ylabel=setting.label(state), xlabel="time (s)" if last else "")
+        style_axes(axes, ylabel=state_label(problem, state), xlabel="time (s)" if last else "")
         axes.tick_params(labelbottom=last)
         for r in range(count):
-            _band(axes, times, setting, tubes, r, state)
+            _band(axes, times, problem, tubes, r, state)
         for example in record.counterexamples:
             axes.plot(times, example.states[:, state], color=DANGER, linewidth=1.2, zorder=8)
-        goal_at_end(axes, setting, state, times[-1])
+        goal_at_end(axes, problem, state, times[-1])
     handles = [
         Patch(facecolor=MODES[0], alpha=0.35, label="tube of each cell"),
         Line2D([], [], color=GOAL, lw=4, label="goal at the end"),
     ]
     legend_above(panels[0], handles)
     axes = figure.add_subplot(grid[-1, -1], sharex=panels[0])
-    _clearances(axes, times, setting, tubes)
+    _clearances(axes, times, problem, tubes)
     axes.set_xlim(0, times[-1])
     figure.align_ylabels([*panels, axes])
 
@@ -117,10 +120,10 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     return figure
 
 
-def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alpha: float = 0.3) -> None:
+def draw_tube(axes: Axes, problem: Problem, tubes: Tubes, reference: int, *, alpha: float = 0.3) -> None:
     """One reference in the workspace: cross-sections of its cells' tubes, its start cells, and itself."""
-    mine, plane = tubes.cell_reference == reference, setting.plane
-    steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
+    mine, plane = tubes.cell_reference == reference, plane_of(problem)
+    steps = shown_steps(problem, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, plane], tubes.tube_upper[mine][:, :steps, plane]
     tube_boxes(axes, lower, upper, alpha=alpha / np.sqrt(max(1, len(lower) / 4)), of=tubes.tube_lower.shape[1])
     draw_boxes(
@@ -137,10 +140,10 @@ def draw_tube(axes: Axes, setting: Setting, tubes: Tubes, reference: int, *, alp
     axes.plot(*path.T, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=7)
 
 
-def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, reference: int, state: int) -> None:
+def _band(axes: Axes, times: np.ndarray, problem: Problem, tubes: Tubes, reference: int, state: int) -> None:
     """Bounds of one state, cell by cell; where the tube outgrows the workspace it ends at a dashed line."""
     mine, colour = tubes.cell_reference == reference, MODES[reference % len(MODES)]
-    steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
+    steps = shown_steps(problem, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, state], tubes.tube_upper[mine][:, :steps, state]
     if steps:
         across = np.concatenate([times[:steps], times[:steps][::-1]])
@@ -156,19 +159,19 @@ def _band(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes, referen
     axes.plot(times, tubes.references[reference, :, state], color=REFERENCE, linewidth=1.0, linestyle=(0, (4, 2)))
 
 
-def _clearances(axes: Axes, times: np.ndarray, setting: Setting, tubes: Tubes) -> None:
+def _clearances(axes: Axes, times: np.ndarray, problem: Problem, tubes: Tubes) -> None:
     """Certified distance of the tubes to every constraint over each step; not above the red line nothing is proved."""
-    index = list(setting.dynamics.position)
+    index = list(problem.dynamics.position)
     lower, upper = tubes.tube_lower[..., index], tubes.tube_upper[..., index]
     lower = np.nan_to_num(lower, nan=-np.inf, posinf=-np.inf)
     upper = np.nan_to_num(upper, nan=np.inf, neginf=np.inf)
     parts = over_steps(Tube(torch.from_numpy(lower), torch.from_numpy(upper)))
-    found = setting.scene.clearances(Box(parts.lower, parts.upper)).amin((0, 2)).numpy()
+    found = problem.scene.clearances(Box(parts.lower, parts.upper)).amin((0, 2)).numpy()
     style_axes(axes, xlabel="time (s)", ylabel="clearance (m)")
     names = list(tubes.constraint_names)
     if len(names) > 4:  # too many lines to tell apart
         found, names = np.stack([found[:, 0], found[:, 1:].min(1)], axis=1), [names[0], "nearest obstacle"]
-    steps = shown_steps(setting, tubes.tube_lower, tubes.tube_upper)
+    steps = shown_steps(problem, tubes.tube_lower, tubes.tube_upper)
     lines = [axes.axhline(0, color=DANGER, linewidth=1.1, label="contact")]
     found = np.concatenate([found, found[-1:]])  # of each step up to its end
     for i, name in enumerate(names):

@@ -8,15 +8,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.canvas import (
     MODES,
     MUTED,
-    Setting,
     blank_figure,
     draw_paths,
     draw_scene,
     headline,
     legend_above,
+    plane_of,
     style_axes,
     unit_text,
 )
@@ -25,8 +26,8 @@ from sagemp_cli.storage import Artifact, Demonstrations
 
 def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
     """Positions to scale on the left, controls over time with their limits on the right."""
-    record, setting = artifact.record, Setting.of(artifact.header.config)
-    dynamics = setting.dynamics
+    record, problem = artifact.record, problem_of(artifact.header.config)
+    dynamics = problem.dynamics
     count, horizon = record.controls.shape[:2]
     groups = [side for side, _ in Counter(record.side).most_common()]
     colour = {side: MODES[i % len(MODES)] for i, side in enumerate(groups)}
@@ -36,12 +37,17 @@ def draw_demonstrations(artifact: Artifact[Demonstrations]) -> Figure:
     figure = blank_figure(13, max(5.2, 1.75 * dynamics.control_dim))
     grid = figure.add_gridspec(dynamics.control_dim, 2, width_ratios=(2.3, 1))
     scene = figure.add_subplot(grid[:, 0])
-    draw_scene(scene, setting)
+    draw_scene(scene, problem)
+    plane = plane_of(problem)
     for side in groups:
         draw_paths(
-            scene, record.states[sides == side][..., setting.plane], colors=colour[side], linewidths=0.8, alpha=alpha
+            scene,
+            record.states[sides == side][..., plane],
+            colors=colour[side],
+            linewidths=0.8,
+            alpha=alpha,
         )
-    starts = record.states[:, 0, setting.plane]
+    starts = record.states[:, 0, plane]
     scene.scatter(starts[:, 0], starts[:, 1], s=5, color=MUTED, linewidths=0, zorder=4)
     handles = [Line2D([], [], color=colour[s], lw=2, label=f"{s or 'free'}: {int((sides == s).sum())}") for s in groups]
     legend_above(scene, handles)

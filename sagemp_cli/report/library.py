@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.canvas import (
     DANGER,
     INK,
@@ -14,7 +15,6 @@ from sagemp_cli.report.canvas import (
     MUTED,
     SAFE,
     UNKNOWN,
-    Setting,
     blank_figure,
     draw_boxes,
     draw_paths,
@@ -22,6 +22,7 @@ from sagemp_cli.report.canvas import (
     draw_start,
     headline,
     legend_above,
+    plane_of,
     style_axes,
     subject,
 )
@@ -30,16 +31,16 @@ from sagemp_cli.storage import Artifact, Library
 
 def draw_library(artifact: Artifact[Library]) -> Figure:
     """Tubes and references on the left, the account of all samples on the right."""
-    record, setting = artifact.record, Setting.of(artifact.header.config)
-    tubes, plane = record.tubes, setting.plane
+    record, problem = artifact.record, problem_of(artifact.header.config)
+    tubes, plane = record.tubes, plane_of(problem)
     assert tubes.references is not None
     count, horizon = len(tubes.verdict), tubes.tube_lower.shape[1] - 1
     figure = blank_figure(13, 5.4)
     grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1))
 
     scene = figure.add_subplot(grid[0])
-    draw_scene(scene, setting)
-    draw_start(scene, setting)
+    draw_scene(scene, problem)
+    draw_start(scene, problem)
     early = np.array([r.startswith("reference") for r in record.rejected_reason], dtype=bool)
     for mask, colour in ((early, DANGER), (~early, UNKNOWN)):
         draw_paths(

@@ -10,18 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sagemp_cli.pipeline.models import planner_from
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.planners.base import affordable
 from sagemp_cli.report.canvas import (
     DANGER,
     MODES,
     MUTED,
-    Setting,
     blank_figure,
     draw_paths,
     draw_scene,
     draw_start,
     headline,
     legend_above,
+    plane_of,
 )
 from sagemp_cli.report.training import draw_losses, draw_validation
 from sagemp_cli.scenes.sides import side_label, sides_of
@@ -39,29 +40,29 @@ def draw_planner(artifact: Artifact[PlannerModel]) -> Figure:
 
     Beside them the losses and the validation curve, where the planner was trained.
     """
-    setting, planner = Setting.of(artifact.header.config), planner_from(artifact)
+    problem, planner = problem_of(artifact.header.config), planner_from(artifact)
     generator = torch.Generator().manual_seed(artifact.header.seed)
     count = affordable(planner, SAMPLES)
     references = planner.sample(
-        setting.start.sample(count, generator),
-        setting.scene.goal,
-        scene=setting.scene,
+        problem.start.sample(count, generator),
+        problem.scene.goal,
+        scene=problem.scene,
         count=count,
         generator=generator,
     )
-    position = list(setting.dynamics.position)
-    clear = (setting.scene.signed_distance_along(references[..., position]) > 0).all(-1).numpy()
-    reaches = setting.scene.goal.contains(references[:, -1]).numpy()
-    paths = references[..., setting.plane].numpy()
+    position = list(problem.dynamics.position)
+    clear = (problem.scene.signed_distance_along(references[..., position]) > 0).all(-1).numpy()
+    reaches = problem.scene.goal.contains(references[:, -1]).numpy()
+    paths = references[..., plane_of(problem)].numpy()
     places = references[..., position].numpy()
-    sides = np.array([side_label(sides_of(path, setting.scene.obstacles), len(position)) for path in places])
+    sides = np.array([side_label(sides_of(path, problem.scene.obstacles), len(position)) for path in places])
 
     trained = len(artifact.record.curve.step) > 0
     figure = blank_figure(13 if trained else 9, 5.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1)) if trained else figure.add_gridspec(2, 1)
     scene = figure.add_subplot(grid[:, 0])
-    draw_scene(scene, setting)
-    draw_start(scene, setting)
+    draw_scene(scene, problem)
+    draw_start(scene, problem)
     handles = []
     for i, (side, _) in enumerate(Counter(sides[clear]).most_common()):
         shown, colour = paths[clear & (sides == side)], MODES[i % len(MODES)]

@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.canvas import (
     DANGER,
     MODES,
     MUTED,
     SAFE,
-    Setting,
     blank_figure,
     draw_boxes,
     draw_paths,
@@ -22,6 +22,8 @@ from sagemp_cli.report.canvas import (
     goal_at_end,
     headline,
     legend_above,
+    plane_of,
+    state_label,
     style_axes,
     subject,
 )
@@ -36,8 +38,8 @@ NAMED = 3
 
 def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> Figure:
     """Rollouts to scale over the tubes of the references that were tracked; every state over time beside them."""
-    record, setting = artifact.record, Setting.of(artifact.header.config)
-    dynamics, tubes, plane = setting.dynamics, library.record.tubes, setting.plane
+    record, problem = artifact.record, problem_of(artifact.header.config)
+    dynamics, tubes, plane = problem.dynamics, library.record.tubes, plane_of(problem)
     total, horizon = len(record.states), record.states.shape[1] - 1
     chosen = record.chosen[record.query]
     some = np.unique(np.linspace(0, total - 1, min(DRAWN, total)).astype(int))
@@ -48,13 +50,13 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
     figure = blank_figure(12 + 2 * columns, max(5.4, 1.35 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=(2.05, *[1] * columns))
     scene = figure.add_subplot(grid[:, 0])
-    draw_scene(scene, setting)
-    draw_start(scene, setting)
+    draw_scene(scene, problem)
+    draw_start(scene, problem)
     panels, times = [], dynamics.dt * np.arange(horizon + 1)
     for i in range(dynamics.state_dim):
         axes = figure.add_subplot(grid[i % rows, 1 + i // rows], sharex=panels[0] if panels else None)
         last = i % rows == rows - 1 or i == dynamics.state_dim - 1
-        style_axes(axes, ylabel=setting.label(i), xlabel="time (s)" if last else "")
+        style_axes(axes, ylabel=state_label(problem, i), xlabel="time (s)" if last else "")
         axes.tick_params(labelbottom=last)
         panels.append(axes)
     for r in np.unique(chosen):
@@ -76,7 +78,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
     for i, axes in enumerate(panels):
         axes.autoscale_view()
         axes.set_xlim(0, times[-1])
-        goal_at_end(axes, setting, i, times[-1])
+        goal_at_end(axes, problem, i, times[-1])
     figure.align_ylabels(panels)
     tracked = np.unique(chosen)
     handles: list[Artist]

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from sagemp_cli.pipeline.problem import problem_of
 from sagemp_cli.report.canvas import (
     DANGER,
     INK,
@@ -14,13 +15,13 @@ from sagemp_cli.report.canvas import (
     MUTED,
     REFERENCE,
     SAFE,
-    Setting,
     blank_figure,
     draw_boxes,
     draw_paths,
     draw_scene,
     draw_start,
     headline,
+    plane_of,
     subject,
 )
 from sagemp_cli.report.safety_table import CERTIFIED, SafetyRow, certified, percentage, safety_rows
@@ -36,14 +37,14 @@ def draw_safety(artifact: Artifact[SafetyRates]) -> Figure:
     Of each reference and kind of disturbance the rollout of the least clearance is drawn. Each panel says which share
     of the references is safe in it (all their rollouts are), and the paper's where there is one.
     """
-    record, setting = artifact.record, Setting.of(artifact.header.config)
-    plane, proved = setting.plane, certified(record)
+    record, problem = artifact.record, problem_of(artifact.header.config)
+    plane, proved = plane_of(problem), certified(record)
     rows = open_row, closed_row, proof_row = safety_rows(artifact)
     figure = blank_figure(15, 7.0)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     for axes, row in zip(panels, rows, strict=True):
-        draw_scene(axes, setting)
-        draw_start(axes, setting)
+        draw_scene(axes, problem)
+        draw_start(axes, problem)
         _title(axes, row)
     for axes in panels[1:]:
         axes.set_ylabel("")

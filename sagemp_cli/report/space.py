@@ -11,7 +11,8 @@ from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from sagemp_cli.report.canvas import GOAL, HAIRLINE, INK, MUTED, OBSTACLE, REFERENCE, TIME, Setting, shown_steps
+from sagemp_cli.problem import Problem
+from sagemp_cli.report.canvas import GOAL, HAIRLINE, INK, MUTED, OBSTACLE, REFERENCE, TIME, shown_steps, state_label
 from sagemp_cli.scenes import Ball
 from sagemp_cli.storage import Tubes
 
@@ -21,14 +22,14 @@ _BITS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=bool
 _LIGHT = np.array([-0.5, -0.6, 0.8]) / np.linalg.norm([-0.5, -0.6, 0.8])
 
 
-def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
+def space_axes(figure: Figure, place: SubplotSpec, problem: Problem) -> Axes3D:
     """Axes with the scene to scale: the room's edges, shaded obstacles, the goal box."""
     axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
-    low, high = setting.scene.workspace.lower.numpy(), setting.scene.workspace.upper.numpy()
+    low, high = problem.scene.workspace.lower.numpy(), problem.scene.workspace.upper.numpy()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=1.03)  # pyright: ignore[reportArgumentType]  (declared as a whole number)
     axes.view_init(elev=24, azim=-62)
-    labels = [setting.label(i) for i in setting.dynamics.position]
+    labels = [state_label(problem, i) for i in problem.dynamics.position]
     sides: tuple[Any, ...] = (axes.xaxis, axes.yaxis, axes.zaxis)  # Matplotlib declares the axes of the plane for these
     for axis, label in zip(sides, labels, strict=True):
         axis.set_pane_color("white")
@@ -36,7 +37,7 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
         axis.set_label_text(label, fontsize=9.5, color=INK)
         axis._axinfo["grid"].update(color=HAIRLINE, linewidth=0.6)  # no public way to a quiet grid in 3-D
     axes.tick_params(colors=MUTED, labelsize=8)
-    for obstacle in setting.scene.obstacles:
+    for obstacle in problem.scene.obstacles:
         if isinstance(obstacle, Ball):
             _sphere(axes, np.array(obstacle.center), obstacle.radius)
             at = np.array(obstacle.center)
@@ -45,8 +46,8 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
             axes.add_collection3d(Poly3DCollection(faces, facecolor=OBSTACLE, edgecolor="white", linewidth=0.3))
             at = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
         axes.text(at[0], at[1], at[2], obstacle.name, color="white", fontsize=8, ha="center", va="center", zorder=2.5)
-    index = list(setting.dynamics.position)
-    goal = [np.clip(v.numpy()[index], low, high) for v in (setting.scene.goal.lower, setting.scene.goal.upper)]
+    index = list(problem.dynamics.position)
+    goal = [np.clip(v.numpy()[index], low, high) for v in (problem.scene.goal.lower, problem.scene.goal.upper)]
     faces = box_faces(goal[0][None], goal[1][None])
     axes.add_collection3d(Poly3DCollection(faces, facecolor=GOAL, alpha=0.1, edgecolor=GOAL, linewidth=1.3, zorder=6))
     middle = 0.5 * (goal[0] + goal[1])
@@ -54,18 +55,18 @@ def space_axes(figure: Figure, place: SubplotSpec, setting: Setting) -> Axes3D:
     return axes
 
 
-def space_tube(axes: Axes3D, setting: Setting, tubes: Tubes, reference: int) -> None:
+def space_tube(axes: Axes3D, problem: Problem, tubes: Tubes, reference: int) -> None:
     """One reference: cross-sections of its cells' tubes coloured by time, its start cells, and itself.
 
     What lies behind an obstacle for the viewer is drawn before it.
     """
-    mine, index = tubes.cell_reference == reference, list(setting.dynamics.position)
-    steps = shown_steps(setting, tubes.tube_lower[mine], tubes.tube_upper[mine])
+    mine, index = tubes.cell_reference == reference, list(problem.dynamics.position)
+    steps = shown_steps(problem, tubes.tube_lower[mine], tubes.tube_upper[mine])
     lower, upper = tubes.tube_lower[mine][:, :steps, index].min(0), tubes.tube_upper[mine][:, :steps, index].max(0)
     assert tubes.references is not None
     path = tubes.references[reference][:, index]
     shade = TIME(np.arange(steps) / max(1, tubes.tube_lower.shape[1] - 1))
-    behind = _behind(axes, setting, 0.5 * (lower + upper))
+    behind = _behind(axes, problem, 0.5 * (lower + upper))
     for part, zorder in ((behind, 1), (~behind, 4)):
         if part.any():
             faces = box_faces(lower[part], upper[part])
@@ -73,9 +74,9 @@ def space_tube(axes: Axes3D, setting: Setting, tubes: Tubes, reference: int) -> 
             axes.add_collection3d(
                 Poly3DCollection(faces, facecolors=edges, edgecolors=edges, linewidths=0.3, alpha=0.22, zorder=zorder)
             )
-    floor = np.full(len(path), float(setting.scene.workspace.lower[2]))
+    floor = np.full(len(path), float(problem.scene.workspace.lower[2]))
     axes.plot(path[:, 0], path[:, 1], floor, color=MUTED, linewidth=0.9, alpha=0.6, zorder=0.5)  # its shadow
-    hidden = _behind(axes, setting, path)
+    hidden = _behind(axes, problem, path)
     for part, zorder in ((hidden, 1.1), (~hidden, 5)):
         segments = [path[k : k + 2] for k in np.flatnonzero(part[:-1]) if k % 3 < 2]  # dashes
         axes.add_collection3d(
@@ -101,13 +102,13 @@ def _sphere(axes: Axes3D, center: np.ndarray, radius: float) -> None:
     axes.plot_surface(x, y, z, rstride=1, cstride=1, facecolors=colours, shade=False, linewidth=0, zorder=2)
 
 
-def _behind(axes: Axes3D, setting: Setting, points: np.ndarray) -> np.ndarray:
+def _behind(axes: Axes3D, problem: Problem, points: np.ndarray) -> np.ndarray:
     """Which points are farther from the viewer than the middle of the obstacle nearest to them."""
     azim, elev = np.deg2rad(axes.azim), np.deg2rad(axes.elev)
     to_viewer = np.array([np.cos(elev) * np.cos(azim), np.cos(elev) * np.sin(azim), np.sin(elev)])
     middles: Sequence[np.ndarray] = [
         np.array(o.center) if isinstance(o, Ball) else 0.5 * (np.array(o.lower) + np.array(o.upper))
-        for o in setting.scene.obstacles
+        for o in problem.scene.obstacles
     ]
     if not middles:
         return np.zeros(len(points), dtype=bool)

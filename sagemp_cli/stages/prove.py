@@ -13,7 +13,7 @@ import torch
 
 from sagemp_cli.errors import UsageError, did_you_mean
 from sagemp_cli.pipeline.loop_record import strangers_loop_record
-from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
 from sagemp_cli.reachability.any_loop import counts_of, propagator_of
 from sagemp_cli.reachability.observed import observed
 from sagemp_cli.reachability.propagator import Loop, Propagator
@@ -21,8 +21,7 @@ from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.strangers_loop import LoopSetting, draw_loop
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Between, Box
-from sagemp_cli.storage import Certificate, Counterexample, Header, refuse_existing, write_artifact
-from sagemp_cli.verification.attack.falsifier import Counterexample as Found
+from sagemp_cli.storage import Certificate, Header, refuse_existing, write_artifact
 from sagemp_cli.verification.strangers_loop import LoopClaim, LoopProof, verify_loop
 
 SCENE_KEYS = ("workspace", "obstacles", "goal", "name", "description")
@@ -117,6 +116,7 @@ def prove(
         "disturbance": _corners(seen.disturbance),
         **({"scene": problem} if problem else {}),
     }
+    found, decided = proof.counterexample, proof.verification.verdicts[0].constraint
     record = Certificate(
         tubes=dataclasses.replace(tubes_record(proof.verification), references=None),
         loop=strangers_loop_record(
@@ -126,7 +126,7 @@ def prove(
             position=claim.position if problem.keys() & {"workspace", "obstacles"} else (),
             dt=dt,
         ),
-        counterexamples=() if proof.counterexample is None else (_counterexample(proof.counterexample, claim),),
+        counterexamples=() if found is None else (counterexample_record(0, found, decided),),
         falsifier_rollouts=proof.rollouts,
         verdict=str(proof.answer),
         true_model=None,
@@ -202,17 +202,3 @@ def _state(given: int | str, names: Sequence[str]) -> int:
 
 def _corners(box: Box) -> dict[str, list[float]]:
     return {"lower": box.lower.tolist(), "upper": box.upper.tolist()}
-
-
-def _counterexample(found: Found, claim: LoopClaim) -> Counterexample:
-    goal = found.kind == "goal"
-    return Counterexample(
-        reference=0,
-        kind="collision" if found.kind == "obstacle" else found.kind,
-        step=found.step,
-        fraction=found.fraction,
-        constraint=f"goal {claim.state_names[found.state]}" if goal else found.name,
-        depth=found.depth,
-        states=found.states.numpy(),
-        disturbances=found.disturbances.numpy(),
-    )

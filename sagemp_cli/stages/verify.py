@@ -19,13 +19,12 @@ from sagemp_cli.pipeline.reference_file import read_references
 from sagemp_cli.pipeline.sample_share import sample_share
 from sagemp_cli.pipeline.true_model import SECTION as TRUE_MODEL
 from sagemp_cli.pipeline.true_model import TrueModelProof
-from sagemp_cli.pipeline.tubes import tubes_record
+from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
 from sagemp_cli.planners.from_file import FromFile
 from sagemp_cli.planners.trajectory_file import REFERENCES
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import draw_beside
-from sagemp_cli.storage import Artifact, Certificate, Counterexample, Parent
-from sagemp_cli.verification.attack.falsifier import Counterexample as Found
+from sagemp_cli.storage import Artifact, Certificate, Parent
 from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack, decided
 from sagemp_cli.verification.verdict import answer_of
 
@@ -105,7 +104,7 @@ def run(context: StageContext) -> Path:
         tubes=tubes_record(refutation.verification),
         loop=loop_record(problem, tracker),
         counterexamples=tuple(
-            _counterexample(r, found, decided(found, problem.dynamics)) for r, found in refutation.counterexamples
+            counterexample_record(r, found, decided(found, problem.dynamics)) for r, found in refutation.counterexamples
         ),
         falsifier_rollouts=refutation.rollouts,
         verdict=str(answer_of(refutation.verification.verdicts)),
@@ -120,17 +119,3 @@ def run(context: StageContext) -> Path:
 def draw(context: StageContext) -> Path:
     """Draw the figure of what is there."""
     return draw_beside(context.output_path("verify"), draw_certificate, context.read("verify"))
-
-
-def _counterexample(reference: int, found: Found, constraint: str) -> Counterexample:
-    """As stored; an obstacle is a 'collision' there."""
-    return Counterexample(
-        reference=reference,
-        kind="collision" if found.kind == "obstacle" else found.kind,
-        step=found.step,
-        fraction=found.fraction,
-        constraint=constraint,
-        depth=found.depth,
-        states=found.states.numpy(),
-        disturbances=found.disturbances.numpy(),
-    )

@@ -178,6 +178,13 @@ def test_a_config_that_cannot_work_is_refused_before_any_work(overrides, message
         require_sound_config(compose(overrides))
 
 
+def test_a_seed_that_stages_take_over_is_complained_of_once():
+    with pytest.raises(ConfigError) as caught:
+        require_sound_config(compose(["seed=-1", "verify.seed=-2"]))
+    wrong = "seed must be a whole number of at least 0, found"
+    assert str(caught.value) == f"{wrong} -1; verify.{wrong} -2"
+
+
 def test_all_complaints_come_at_once():
     with pytest.raises(ConfigError) as caught:
         require_sound_config(compose(["dynamics.dt=fast", "+tracker.width=3", "+tracker_training.stepz=1"]))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sagemp_cli.errors import ResourceError
-from sagemp_cli.report.canvas import Setting, blank_figure, shown_steps, unit_text
+from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.report.canvas import blank_figure, shown_steps, unit_text
 from sagemp_cli.report.certificate import draw_certificate
 from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.library import draw_library
@@ -117,7 +118,7 @@ def test_a_tube_that_overflows_is_drawn_up_to_there(certificate, tmp_path):
         constraint=("px",),
         clearance=np.full_like(tubes.clearance, -math.inf),
     )
-    assert shown_steps(Setting.of(certificate.header.config), lower, upper) == 10
+    assert shown_steps(problem_of(certificate.header.config), lower, upper) == 10
     odd = dataclasses.replace(odd, record=dataclasses.replace(odd.record, verdict="UNKNOWN"))
     figure = draw_certificate(odd)
     save_figure(figure, tmp_path / "odd.png")

@@ -7,25 +7,26 @@ import pytest
 from mpl_toolkits.mplot3d import Axes3D
 
 from sagemp_cli.config.composition import compose
-from sagemp_cli.report.canvas import Setting, blank_figure
+from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.report.canvas import blank_figure, state_label
 from sagemp_cli.report.figure import save_figure
 from sagemp_cli.report.space import box_faces, space_axes, space_tube
 
 
 @pytest.fixture
-def setting():
-    return Setting.of(compose(["experiment=quadrotor_diffusion"]))
+def problem():
+    return problem_of(compose(["experiment=quadrotor_diffusion"]))
 
 
 @pytest.fixture
-def axes(setting):
+def axes(problem):
     figure = blank_figure(6, 5)
-    return space_axes(figure, figure.add_gridspec(1, 1)[0], setting)
+    return space_axes(figure, figure.add_gridspec(1, 1)[0], problem)
 
 
-def straight_tubes(setting):
+def straight_tubes(problem):
     """One tube around a straight flight through the room, two cells."""
-    start, goal = setting.start.center.numpy(), setting.scene.goal.center.numpy()
+    start, goal = problem.start.center.numpy(), problem.scene.goal.center.numpy()
     path = start + np.linspace(0, 1, 21)[:, None] * (goal - start)
     reach = np.full(12, 0.1)
     cells = np.stack([path - reach, path - reach]), np.stack([path + reach, path + reach])
@@ -48,15 +49,15 @@ def test_a_box_has_six_faces_on_its_sides():
     assert (faces.reshape(-1, 3).min(0) == lower[0]).all() and (faces.reshape(-1, 3).max(0) == upper[0]).all()
 
 
-def test_the_room_is_drawn_to_scale(axes, setting):
+def test_the_room_is_drawn_to_scale(axes, problem):
     assert isinstance(axes, Axes3D)
     assert (axes.get_xlim(), axes.get_zlim()) == ((0, 5), (0, 5))
-    assert axes.get_xlabel() == setting.label(0) and axes.get_zlabel() == setting.label(2)
+    assert axes.get_xlabel() == state_label(problem, 0) and axes.get_zlabel() == state_label(problem, 2)
 
 
-def test_a_tube_is_drawn_partly_behind_and_partly_before_the_obstacle(axes, setting, tmp_path):
+def test_a_tube_is_drawn_partly_behind_and_partly_before_the_obstacle(axes, problem, tmp_path):
     before = len(axes.collections)
-    space_tube(axes, setting, straight_tubes(setting), 0)
+    space_tube(axes, problem, straight_tubes(problem), 0)
     drawn = axes.collections[before:]
     orders = [c.get_zorder() for c in drawn]
     assert min(orders) < 2 < max(orders), "the sphere has zorder 2"
