@@ -74,7 +74,7 @@ def ask(kind: str, seed: int, *, timeout: float, time_limit: float) -> Trial:
             "cache": folder,
         }
         provider, about = ("openai", "gemini")[seed % 3 == 0], service.ServiceOptions(**options)
-        planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider, attempts=1, service=about)
+        planner = VLM(state_dim=3, horizon=20, dt=0.5, provider=provider, attempts=1 + seed % 3, service=about)
         code, message, complaints = 0, "", []
         began = time.monotonic()
         try:

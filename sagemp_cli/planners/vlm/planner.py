@@ -199,7 +199,10 @@ class VLM(nn.Module):
             AnswerError: no usable waypoints after ``attempts`` answers.
             ServiceError: the service cannot be used.
         """
-        return self._references(self.provider, start, goal, scene=scene, count=count, generator=generator)
+        provider = self.provider
+        if isinstance(provider, Service):
+            provider = provider.within(count)
+        return self._references(provider, start, goal, scene=scene, count=count, generator=generator)
 
     def _references(
         self, provider: Provider, start: Tensor, goal: Box, *, scene: Scene, count: int, generator: torch.Generator

@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from pathlib import Path
@@ -45,7 +45,8 @@ class ServiceOptions:
         temperature: of the sampling.
         image_height: pixels of the picture that is sent.
         timeout: seconds that one request may take, from its process's start to the last byte.
-        time_limit: seconds that a question may take with all repetitions and pauses.
+        time_limit: seconds that a plan may take with all answers that are asked for it, repetitions and pauses; several
+            plans that are asked for together share as many times that.
         retries: repetitions after a temporary failure.
         backoff: seconds before the first repetition; doubled each time; a service's Retry-After counts if longer.
         cache: folder of answers, by what was asked; None keeps none.
@@ -121,10 +122,12 @@ class Service:
     Attributes:
         endpoint: which one.
         options: address, model and limits.
+        deadline: when all answers must be there, on the clock of ``time.monotonic``; None: see :meth:`within`.
     """
 
     endpoint: Endpoint
     options: ServiceOptions
+    deadline: float | None = None
 
     @property
     def model(self) -> str:
@@ -136,14 +139,20 @@ class Service:
         """What answers, for figures."""
         return f"{self.endpoint.name}: {self.model}"
 
+    def within(self, plans: int) -> Service:
+        """The same with the time that so many plans may take from now on, however often they are asked for."""
+        return replace(self, deadline=time.monotonic() + plans * self.options.time_limit)
+
     def answers(self, questions: Sequence[Question], *, generator: torch.Generator) -> list[str]:
         """One answer per question; equal questions get a seed each, so answers may differ.
 
         The seeds come from ``generator``, so a run that is repeated asks the same and finds its answers in the cache.
 
         Raises:
-            ServiceError: there is no answer to be had.
+            ServiceError: there is no answer to be had, or not in time.
         """
+        if self.deadline is None:
+            return self.within(len(questions)).answers(questions, generator=generator)
         seeds = torch.randint(2**31 - 1, (len(questions),), generator=generator).tolist()
         return [self._answer(question, seed) for question, seed in zip(questions, seeds, strict=True)]
 
@@ -199,10 +208,14 @@ class Service:
 
     def _asked(self, request: dict[str, Any]) -> str:
         """The answer to a request, repeated until there is one, a final refusal, or the end of the time."""
-        deadline, pause = time.monotonic() + self.options.time_limit, self.options.backoff
+        assert self.deadline is not None
+        name, pause = self.endpoint.name, self.options.backoff
+        limit = f"the time limit of {self.options.time_limit:g} s a plan"
         for attempt in range(self.options.retries + 1):
-            seconds = min(self.options.timeout, deadline - time.monotonic())
-            outcome = ask_in_process(request, max(seconds, 0.0))
+            seconds = min(self.options.timeout, self.deadline - time.monotonic())
+            if seconds <= 0:
+                raise ServiceError(f"{name}: gave up, {limit} ran out")
+            outcome = ask_in_process(request, seconds)
             if outcome is None:
                 outcome = {"lost": f"no reply within {seconds:.3g} s"}
             if "answer" in outcome:
@@ -210,11 +223,10 @@ class Service:
             trouble = self._trouble(outcome)
             wait = max(_retry_after(outcome.get("retry_after")), pause)
             if attempt == self.options.retries:
-                raise ServiceError(f"{self.endpoint.name}: gave up after {attempt + 1} requests ({trouble})")
-            if time.monotonic() + wait >= deadline:
+                raise ServiceError(f"{name}: gave up after {attempt + 1} requests ({trouble})")
+            if time.monotonic() + wait >= self.deadline:
                 raise ServiceError(
-                    f"{self.endpoint.name}: gave up after {attempt + 1} requests, the next would come after the time "
-                    f"limit of {self.options.time_limit:g} s ({trouble})"
+                    f"{name}: gave up after {attempt + 1} requests, the next would come after {limit} ({trouble})"
                 )
             time.sleep(wait)
             pause *= 2

