@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ArtifactError, UsageError
-from sagemp_cli.planners.trajectory_file import REFERENCES, arrays_in
+from sagemp_cli.planners.trajectory_file import LARGEST, REFERENCES, arrays_in
 from sagemp_cli.verification.verification import require_finite
 
 
@@ -25,7 +25,8 @@ def read_references(path: Path, *, horizon: int, state_names: Sequence[str]) -> 
         state_names: of the robot, n of them.
 
     Raises:
-        ArtifactError: missing, unreadable, or without such a dataset of real numbers.
+        ArtifactError: missing, unreadable, without such a dataset of real numbers, or with one beyond
+            :data:`~sagemp_cli.planners.trajectory_file.LARGEST`.
         UsageError: wrong shape or horizon.
         NonFiniteError: a NaN or an infinity.
     """
@@ -46,4 +47,11 @@ def read_references(path: Path, *, horizon: int, state_names: Sequence[str]) -> 
         require_finite(references, state_names)
     except UsageError as e:
         raise type(e)(f"{path}: {e}") from None
+    beyond = torch.nonzero(references.abs() > LARGEST)
+    if len(beyond):
+        r, k, i = beyond[0].tolist()
+        raise ArtifactError(
+            f"{path}: reference {r} has {state_names[i]} = {float(references[r, k, i]):g} at step {k}; "
+            f"at most {LARGEST:g} is allowed"
+        )
     return references

@@ -31,9 +31,11 @@ REFERENCES = "references"
 TIME = "t"
 LABEL = "trajectory"
 
+LARGEST = 1e9
+"""Size of a coordinate at most: float64 resolves a tenth of a micrometre there, and no robot gets that far."""
+
 _HDF5 = (".h5", ".hdf5")
 _LARGEST_CSV = 2**26
-_LARGEST = 1e9
 _LATEST = 1e20
 
 Array = NDArray[np.float64]
@@ -189,7 +191,7 @@ def _require_sound(path: Path, trajectory: RecordedTrajectory) -> None:
         if values is not None and not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
             raise ArtifactError(f"{where} has {name} = {values[row]} in row {row}; numbers must be finite")
-        most, unit = (_LATEST, " s; t is in seconds") if name == TIME else (_LARGEST, "")
+        most, unit = (_LATEST, " s; t is in seconds") if name == TIME else (LARGEST, "")
         if values is not None and (np.abs(values) > most).any():
             row = int(np.argmax(np.abs(values) > most))
             raise ArtifactError(f"{where} has {name} = {values[row]:g} in row {row}; at most {most:g}{unit} is allowed")

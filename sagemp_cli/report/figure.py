@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from sagemp_cli.report.bounded_canvas import BoundedCanvas
 from sagemp_cli.storage.atomic import write_whole
 
 
@@ -24,7 +24,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     Raises:
         ResourceError: the folder cannot be written or the disk is full.
     """
-    FigureCanvasAgg(figure)
+    BoundedCanvas(figure)
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", metadata={"Software": "sagemp"})
     return write_whole(path, drawn.getvalue(), overwrite=True)

@@ -48,6 +48,11 @@ def test_references_are_read_as_they_are(tmp_path, plans, name):
         (lambda p: p[:, :4], UsageError, "references have 3 steps, but horizon is 5; they must have shape"),
         (lambda p: np.where(p == p[1, 2, 3], np.nan, p), NonFiniteError, "reference 1 is nan at step 2 in state 'v'"),
         (lambda p: np.where(p == p[2, 0, 0], np.inf, p), NonFiniteError, "reference 2 is inf at step 0 in state 'px'"),
+        (
+            lambda p: np.where(p == p[1, 0, 2], -1e300, p),
+            ArtifactError,
+            "reference 1 has theta = -1e[+]300 at step 0; at",
+        ),
         (lambda p: p.astype(complex), ArtifactError, "'references' must hold real numbers, found type complex128"),
     ],
 )
