@@ -1,10 +1,10 @@
 """One command of ``sagemp`` in a process of its own, forked from this one, and what it took.
 
 Importing torch and its like takes a second and more, a command on a small file a tenth of that. So this process imports
-the whole package once, composes the configs that are asked for again and again, and *forks* for every command: what is
-measured is the command without that. It is ``main`` with its own arguments, folder, streams and limits, and its reader
-is a process of its own, under its own limits, but forked as well. ``fresh`` runs the same command from nothing, by the
-interpreter.
+the whole package once, composes the configs that are asked for again and again, may run commands itself to warm up, and
+*forks* for every command: what is measured is the command without that. It is ``main`` with its own arguments, folder,
+streams and limits, and its reader is a process of its own, under its own limits, but forked as well. ``fresh`` runs the
+same command from nothing, by the interpreter.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import contextlib
 import copy
 import gc
 import importlib
+import io
 import json
 import os
 import pkgutil
@@ -62,8 +63,12 @@ class Ended:
     said: Mapping[str, Any] = field(default_factory=dict)
 
 
-def preload(configs: Sequence[Sequence[str]] = ()) -> None:
-    """Import the package, all of it that runs in the commands' own process, and compose the configs of these overrides.
+def preload(configs: Sequence[Sequence[str]], commands: Sequence[Sequence[str]]) -> None:
+    """Import the package, all of it that runs in the commands' own process, compose configs, and run commands once.
+
+    Args:
+        configs: overrides of each.
+        commands: arguments of each; they run in this process and folder.
 
     Raises:
         RuntimeError: this process has more than one thread, so a fork of it may hang.
@@ -77,10 +82,29 @@ def preload(configs: Sequence[Sequence[str]] = ()) -> None:
         importlib.import_module(name)
     importlib.import_module("torch").set_num_threads(1)
     _compose_once(configs)
+    _warm_up(commands)
     gc.collect()
     gc.freeze()  # or a collection in a fork would copy all of it
     if len(os.listdir("/proc/self/task")) > 1:
         raise RuntimeError(f"this process has threads: {threading.enumerate()}")
+
+
+def _warm_up(commands: Sequence[Sequence[str]]) -> None:
+    import typer.main
+
+    from sagemp_cli.cli import main
+    from sagemp_cli.reading import reader
+
+    main.app = typer.main.get_command(main.app)  # it is built anew with every call otherwise
+    for arguments in commands:
+        sys.argv = ["sagemp", *arguments]
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            try:
+                main.main()
+            except SystemExit as e:
+                if e.code not in (0, None):
+                    raise RuntimeError(f"sagemp {' '.join(arguments)} ended with {e.code}") from None
+    reader._READER.end()
 
 
 def _compose_once(configs: Sequence[Sequence[str]]) -> None:

@@ -3,7 +3,7 @@
     python benchmarks/mutated_files.py [--mutants 10000] [--seed 0] [--folder build/mutated_files] [--fresh 50]
 
 Each mutant (``mutants.py``) is given to one of the commands that read such a file, drawn at random (those that make a
-file anew, which take longest, a third as often); with ``--all`` to each of them. A command has to end with a documented
+file anew, which take longest, a fifth as often); with ``--all`` to each of them. A command has to end with a documented
 exit code within 60 s of processor time, and it and its reader process within 2 GiB each. It must not open a file beside
 the mutant that it was not told of, must not say what is in one, must change no file but its own output, and leave
 nothing half-written.
@@ -101,7 +101,10 @@ def main() -> None:
     folder = given.folder.resolve()
     prepare(folder)
     os.chdir(folder)
-    preload(configs())
+    shutil.rmtree("artifacts", ignore_errors=True)
+    shutil.copytree("right", "artifacts")
+    right = (asked for target in READERS if target not in FILES for asked in READERS[target])
+    preload(configs(), [[p.format(file=f"{HERE}/certificate.h5") for p in asked] for asked in right])
     tally = Tally.resumed(folder / "summary.json", given.seed)
     every = max(1, given.mutants // given.fresh) if given.fresh else 0
     while tally.next < given.seed + given.mutants:
@@ -179,20 +182,19 @@ def prepare(folder: Path) -> None:
     shutil.copytree(folder / "artifacts", folder / "right")
 
 
-def configs() -> list[list[str]]:
+def configs() -> list[tuple[str, ...]]:
     """Overrides of the configs that have no mutant in them."""
-    named = [f"mutant{Path(name).suffix}" for name in FILES["plan"]]
-    asked = [
-        [part.format(file=name) for part in a] for t in READERS if t not in YAML for a in READERS[t] for name in named
-    ]
-    return [overrides for a in asked if (overrides := [part for part in a if "=" in part])]
+    names = [f"mutant{Path(name).suffix}" for name in FILES["plan"]]
+    asked = [a for target in READERS if target not in YAML for a in READERS[target]]
+    found = [tuple(part.format(file=name) for part in a if "=" in part) for a in asked for name in names]
+    return list(dict.fromkeys(overrides for overrides in found if overrides))
 
 
 def try_one(folder: Path, seed: int, *, every: bool, fresh: bool) -> list[dict[str, Any]]:
     """One mutant and one or every command that reads it: a line for each."""
     draw = random.Random(f"target {seed}")
     target = draw.choices(list(READERS), [WEIGHTS[t] for t in READERS])[0]
-    weights = [1 if "--overwrite" in asked else 3 for asked in READERS[target]]
+    weights = [1 if "--overwrite" in asked else 5 for asked in READERS[target]]
     asked_for = READERS[target] if every else draw.choices(READERS[target], weights)
     lines = []
     for started in (False, True) if fresh else (False,):
