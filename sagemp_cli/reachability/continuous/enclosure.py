@@ -14,13 +14,17 @@ Everything is for all parts of all periods and cells at once, and rounded outwar
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.continuous.expansion import Expansion
-from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
+from sagemp_cli.reachability.interval.form import IntervalForm
+from sagemp_cli.reachability.interval.form import evaluate as any_evaluate
+from sagemp_cli.reachability.program.program import Instruction
 from sagemp_cli.sets import Box, round_down, round_up
 from sagemp_cli.sets.rounding import TINY
 
@@ -70,6 +74,18 @@ def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | 
     low, high = _times(last, power[1], float(power[0]))
     curve = round_up(torch.maximum(second.lower.abs(), second.upper.abs()) * (h * h * (1 + 1e-12)))
     return Enclosure(stay.lower, stay.upper, round_down(low - end), round_up(high + end), _number(curve), drift)
+
+
+def evaluate(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
+    """What an instruction makes of intervals over which it is smooth; unbounded where an angle may jump, although its
+    values are bounded there: it has no derivative.
+    """
+    found = any_evaluate(i, operands)
+    if i.kind != "atan2":
+        return found
+    y, x = operands
+    smooth = (x.lower > 0) | (y.lower > 0) | (y.upper < 0)
+    return IntervalForm(torch.where(smooth, found.lower, -math.inf), torch.where(smooth, found.upper, math.inf))
 
 
 def _number(bound: Tensor) -> Tensor:
