@@ -9,6 +9,8 @@ import numpy as np
 
 from sagemp_cli.checker.balls import BITS, arb, ball, balls, ctx
 from sagemp_cli.checker.loop import Folded, Loop
+from sagemp_cli.checker.ode import Flow
+from sagemp_cli.checker.part import FlowClaim, PartProver
 from sagemp_cli.checker.ranges import Range, range_of
 from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.unproved import Unproved
@@ -27,10 +29,12 @@ class CellClaim:
         lower, upper: the cell, ``(n,)``.
         tube_lower, tube_upper: ``(K+1, n)``.
         control_lower, control_upper: ``(K, m)``; may be infinite.
-        disturbance_lower, disturbance_upper: W.
+        disturbance_lower, disturbance_upper: of each step, ``(K, d)``; W, and in continuous time what a step is given
+            beside it.
         slope, offset, radius: ``(K, E)``.
         kept: ``(K, bytes)`` or None.
         deviation: bounds of the output of that name, ``(K, n)``, or None.
+        flow: in continuous time, what is claimed between the instants.
     """
 
     program: np.ndarray
@@ -48,19 +52,24 @@ class CellClaim:
     radius: np.ndarray
     kept: np.ndarray | None
     deviation: np.ndarray | None
+    flow: FlowClaim | None = None
 
 
-def prove_cell(claim: CellClaim, programs: Sequence[Folded]) -> str:
+def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None = None) -> str:
     """Prove that every real-arithmetic rollout of the programs that starts in the cell stays in the stored tube, under
-    every disturbance in W^K and with every control and deviation within its stored bounds.
+    every disturbance in its box and with every control and deviation within its stored bounds.
+
+    In continuous time the program is that of a period, and what the boxes of its disturbance stand for is proved of
+    the flow as well: then every solution of the ODE is such a rollout.
 
     The answer is empty, or says in one line what could not be proved.
     """
     with ctx.workprec(BITS), np.errstate(all="ignore"):  # what overflows is found out by Zonotope
         k = 0
         try:
-            w = balls(claim.disturbance_lower), balls(claim.disturbance_upper)
+            w = claim.disturbance_lower, claim.disturbance_upper
             loops = [Loop(folded, claim.windows, *w) for folded in programs]
+            parts = None if flow is None else PartProver(flow, *(side[0, : flow.rate.states] for side in w))
             ranges = [range_of(f, f.program.control) if f.program.control >= 0 else [] for f in programs]
             states = Zonotope.box(claim.lower, claim.upper)
             if not ((claim.tube_lower[0] <= claim.lower) & (claim.upper <= claim.tube_upper[0])).all():
@@ -68,9 +77,14 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded]) -> str:
             for k, which in enumerate(claim.program.tolist()):
                 step = Step(loops[which], k, states, _record(claim, k, programs[which]))
                 after, control, deviation = step.run()
+                asked: list[Bounds] = []
                 if control is not None:
                     asked = [_both(a, b) for a, b in zip(step.bounds(control), ranges[which], strict=True)]
-                    _require_inside(asked, claim.control_lower[k], claim.control_upper[k], "control")
+                m = claim.control_lower.shape[1]
+                _require_inside(asked[:m], claim.control_lower[k], claim.control_upper[k], "control")
+                if parts is not None and claim.flow is not None:
+                    begin = states.bounds() if k else list(zip(balls(claim.lower), balls(claim.upper), strict=True))
+                    _prove_period(parts, claim.flow, k, begin, asked[:m], asked[m:])
                 if claim.deviation is not None:
                     if deviation is None:
                         raise Unproved("the program has no deviation")
@@ -84,6 +98,21 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded]) -> str:
         except (Unproved, ArithmeticError) as e:
             return f"step {k}: {e}"
     return ""
+
+
+def _prove_period(
+    parts: PartProver, flow: FlowClaim, k: int, begin: list[Bounds], control: list[Bounds], inner: list[Bounds]
+) -> None:
+    """Prove what is claimed between two instants; ``inner`` bounds the states at the beginning of parts 2 to S."""
+    n = len(begin)
+    for j in range(flow.lower.shape[1]):
+        if j:
+            begin = inner[(j - 1) * n : j * n]
+            _require_inside(begin, flow.inner_lower[k, j - 1], flow.inner_upper[k, j - 1], f"part {j}: state")
+        try:
+            parts.prove(flow, (k, j), begin, control)
+        except Unproved as e:
+            raise Unproved(f"part {j}: {e}") from None
 
 
 def _record(claim: CellClaim, k: int, folded: Folded) -> list[Entry]:

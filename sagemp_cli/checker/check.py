@@ -327,14 +327,18 @@ def _claim(document: Document, c: int) -> CellClaim:
         tube_upper=tubes["tube_upper"][c],
         control_lower=tubes["control_lower"][r],
         control_upper=tubes["control_upper"][r],
-        disturbance_lower=tubes["disturbance_lower"],
-        disturbance_upper=tubes["disturbance_upper"],
+        disturbance_lower=_at_every_step(tubes["disturbance_lower"], document.horizon),
+        disturbance_upper=_at_every_step(tubes["disturbance_upper"], document.horizon),
         slope=found["slope"][c],
         offset=found["offset"][c],
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
     )
+
+
+def _at_every_step(side: np.ndarray, steps: int) -> np.ndarray:
+    return np.broadcast_to(side, (steps, len(side)))
 
 
 def _finding(

@@ -71,36 +71,36 @@ class Folded:
 
 
 class Loop:
-    """A program on the numbers of all steps, under one box of disturbances.
+    """A program on the numbers of all steps, under a box of disturbances for each.
 
     Args:
         folded: the program.
         windows: numbers of each step, ``(K, g)``.
-        lower, upper: W, exact.
+        lower, upper: the boxes, ``(K, d)``.
     """
 
-    def __init__(self, folded: Folded, windows: np.ndarray, lower: Point, upper: Point) -> None:
+    def __init__(self, folded: Folded, windows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         self.folded = folded
         n, d, g = folded.program.states, folded.program.disturbances, folded.program.numbers
-        middle = [(a + b) / 2 for a, b in zip(lower, upper, strict=True)]
-        radius = [(b - a) / 2 for a, b in zip(lower, upper, strict=True)]
-        steps = range(len(windows))
-        given = [v for v in (ONE, *middle) for _ in steps]  # what the columns of 1 and w are multiplied by
-        known = arb_mat(1 + d + g, len(windows), [*given, *balls(windows.T.flat)])
+        ends = list(zip(balls(lower.T.flat), balls(upper.T.flat), strict=True))  # one disturbance after the other
+        steps = len(windows)
+        middle, radius = [(a + b) / 2 for a, b in ends], [(b - a) / 2 for a, b in ends]
+        self._radius = [radius[k::steps] for k in range(steps)]
+        known = arb_mat(1 + d + g, steps, [*[ONE] * steps, *middle, *balls(windows.T.flat)])
         self._columns, self._on_state, self._rest = {}, {}, {}
         for slot, rows in folded.linear.items():
             wide = [row + [ZERO] * (1 + n + d + g - len(row)) for row in rows]
             self._columns[slot] = joined([[row[0], *row[1 + n :]] for row in wide]) * known
             self._on_state[slot] = arb_mat(len(wide), n, [a for row in wide for a in row[1 : 1 + n]])
-            self._rest[slot] = [
-                _trimmed(row[1 : 1 + n] + [b * r for b, r in zip(row[1 + n : 1 + n + d], radius, strict=True)])
-                for row in wide
-            ]
+            self._rest[slot] = [(row[1 : 1 + n], _trimmed(row[1 + n : 1 + n + d])) for row in wide]
 
     def rows(self, slot: int, k: int, center: arb_mat) -> Rows:
         """Rows of a linear slot at step k, where the states are around the ``center (n, 1)``."""
-        columns, at = self._columns[slot], self._on_state[slot] * center
-        return [[columns[i, k] + at[i, 0], *rest] for i, rest in enumerate(self._rest[slot])]
+        columns, at, radius = self._columns[slot], self._on_state[slot] * center, self._radius[k]
+        return [
+            [columns[i, k] + at[i, 0], *_trimmed(on_state + [b * r for b, r in zip(on_w, radius, strict=False)])]
+            for i, (on_state, on_w) in enumerate(self._rest[slot])
+        ]
 
 
 def keeps_linear(program: Program, slot: int) -> bool:

@@ -138,6 +138,11 @@ class Program:
         """Entries of the control, m; 0 if there is none."""
         return self.widths[self.control] if self.control >= 0 else 0
 
+    @property
+    def reads_disturbance(self) -> bool:
+        """Whether slot 1, the disturbance, is read or an output."""
+        return 1 in (self.next, self.control, self.deviation) or any(1 in i.reads for i in self.instructions)
+
     def fingerprint(self) -> str:
         """SHA-256 of everything in it, hexadecimal."""
         digest = hashlib.sha256(repr((self.next, self.control, self.deviation)).encode())

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import ctx
 
 from sagemp_cli.checker.balls import balls
 from sagemp_cli.checker.loop import Folded, Loop
@@ -24,7 +24,7 @@ def precision():
 
 def bounds(made, record=(), numbers=()):
     """Bounds of the next state over the box, w in +-1/4."""
-    loop = Loop(Folded.of(made), np.array([numbers], float).reshape(1, -1), [arb(-0.25)], [arb(0.25)])
+    loop = Loop(Folded.of(made), np.array([numbers], float).reshape(1, -1), np.array([[-0.25]]), np.array([[0.25]]))
     step = Step(loop, 0, Zonotope.box(LOWER, UPPER), list(record))
     after, *_ = step.run()
     image = step.image(after).bounds()
