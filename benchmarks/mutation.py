@@ -1,9 +1,9 @@
 """Mutants of the core: small mistakes in the sources, each of which some test has to notice.
 
-A mutant is one change: a rounding that is left out, a comparison that is strict or not, an index one too far, a sign,
-the larger for the smaller. The core is copied, one mutant at a time is written into the copy, and the tests that
-belong to its module run there until the first one fails. Every outcome is a line of a log, so that a run that was
-stopped goes on.
+The core is copied, one mutant at a time is written into the copy, and the tests that call the changed function run
+there until the first one fails. Which tests those are, and how long they take, is measured once, test file by test
+file. Every run is a process forked from one that has imported torch and the other libraries, but nothing of the
+project. Outcomes are lines of a log, so that a run that was stopped goes on.
 
     python benchmarks/mutation.py --sample 300            # 300 mutants, chosen by --seed
     python benchmarks/mutation.py --only checker --sample 50
@@ -14,180 +14,320 @@ from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
+import compileall
+import contextlib
+import importlib
 import json
 import os
 import random
+import resource
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
+import threading
 import time
+import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import hypothesis
+import pytest
+from source_mutants import Mutant, mutants_of
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "sagemp_cli"
-CORE = ("sets", "loop", "reachability", "verification", "checker", "execution", "trackers/tube_loss.py")
+CORE = (
+    "sets",
+    "dynamics",
+    "loop",
+    "reachability",
+    "verification",
+    "checker",
+    "execution",
+    "trackers/losses.py",
+    "trackers/tube_loss.py",
+)
+LEFT_OUT = ("reachability/lirpa",)
+"""The adapter of another package, which is an extra."""
 COPIED = (PACKAGE, "tests", "conf", "data", "template", "docs", "benchmarks", "README.md", "pyproject.toml")
+TESTS = ("sets", "dynamics", "loop", "reachability", "verification", "checker", "execution", "trackers", "pipeline")
+"""Folders of tests that may notice; of each mutant those run that call the function it is in."""
+SLOW = ("test_processes.py", "test_cluster.py", "test_mutants.py", "test_program_mutants.py")
+"""Worker processes and campaigns are not run."""
+WARM = """
+    torch torch._dynamo torch.utils._python_dispatch numpy scipy.optimize scipy.sparse scipy.special h5py flint mpmath
+    onnx pydantic omegaconf hydra rich.console typer anyio sympy matplotlib.figure
+    matplotlib.backends.backend_agg
+"""
+"""Libraries that are imported once, before anything is forked."""
 
-TESTS = {
-    "sets": ("tests/sets", "tests/verification/test_verdict.py", "tests/reachability/test_native_propagators.py"),
-    "loop": ("tests/loop", "tests/trackers/test_tracker.py", "tests/reachability/test_native_propagators.py"),
-    "reachability/relaxations": ("tests/reachability/relaxations", "tests/reachability/test_native_propagators.py"),
-    "reachability/affine": (
-        "tests/reachability/test_rounding.py",
-        "tests/reachability/affine",
-        "tests/reachability/test_native_propagators.py",
-    ),
-    "reachability/crown": ("tests/reachability/crown", "tests/reachability/test_native_propagators.py"),
-    "reachability/interval": ("tests/reachability/interval", "tests/reachability/test_native_propagators.py"),
-    "reachability/lirpa": ("tests/reachability/lirpa",),
-    "reachability/program": ("tests/reachability/program", "tests/reachability/test_in_place.py", "tests/reachability"),
-    "reachability": ("tests/reachability/test_rounding.py", "tests/reachability"),
-    "verification": ("tests/verification", "tests/execution", "tests/checker/test_adaptive_cells.py"),
-    "checker": ("tests/checker",),
-    "execution": ("tests/execution", "tests/stages/test_safety_rates.py"),
-    "trackers": ("tests/trackers/test_tube_loss.py",),
-}
-"""Tests of the modules below a path; the longest path counts. What mirrors the module comes first: it fails soonest."""
-
-SWAPPED_NAMES = {
-    "minimum": "maximum",
-    "maximum": "minimum",
-    "amin": "amax",
-    "amax": "amin",
-    "min": "max",
-    "max": "min",
-    "all": "any",
-    "any": "all",
-    "round_up": "round_down",
-    "round_down": "round_up",
-}
-DROPPED_NAMES = {"UNIT": "0.0", "TINY": "0.0", "SAFETY": "1.0"}
-COMPARED = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 TOLERANCE = 3.0
-"""A mutant may take so many times as long as the tests take without one, and half a minute; then it is noticed too."""
+"""A mutant may take so many times as much processor time as its tests without it, and half a minute more."""
+MEMORY = 12 << 30
 
 
 @dataclass(frozen=True)
-class Mutant:
-    """One change of one file.
+class Cost:
+    """What a test takes and calls.
 
     Attributes:
-        file: relative to the root.
-        line: first line of what is changed, from 1.
-        kind: ``rounding``, ``comparison``, ``index``, ``sign`` or ``choice``.
-        begin, end: what is replaced, as offsets into the text.
-        new: what it is replaced by.
-        text: the line before.
+        seconds: of processor time; the first test of a file bears what the file needs.
+        called: functions as ``file:line`` of their first line.
     """
 
-    file: str
-    line: int
-    kind: str
-    begin: int
-    end: int
-    new: str
-    text: str
-
-    @property
-    def key(self) -> str:
-        """What names the mutant as long as its line stays as it is, wherever it moves."""
-        return hashlib.sha256(f"{self.file}|{self.kind}|{self.text}|{self.new}".encode()).hexdigest()[:16]
-
-    def applied(self, source: str) -> str:
-        """The file's text with the change."""
-        return source[: self.begin] + self.new + source[self.end :]
+    seconds: float
+    called: frozenset[str]
 
 
-def mutants_of(path: Path, file: str) -> Iterator[Mutant]:
-    """All mutants of a module."""
-    source = path.read_text(encoding="utf-8")
-    lines = source.splitlines(keepends=True)
-    starts = [0]
-    for line in lines:
-        starts.append(starts[-1] + len(line))
+class Recorder:
+    """A plugin of pytest that notes what each test calls, and the processor time it takes."""
 
-    def offset(line: int, column: int) -> int:
-        return starts[line - 1] + len(lines[line - 1].encode()[:column].decode())
+    def __init__(self, folder: Path) -> None:
+        self.inside = f"{folder}/"
+        self.package = f"{folder}/{PACKAGE}/"
+        self.called: set[tuple[str, int]] = set()
+        self.shared: set[tuple[str, int]] = set()
+        self.costs: dict[str, tuple[float, list[str]]] = {}
+        self.began = time.process_time()
 
-    for node, kind, new in _changes(ast.parse(source)):
-        begin, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
-        around = lines[node.lineno - 1].strip() + f" @{node.col_offset}"
-        yield Mutant(file, node.lineno, kind, begin, end, new, around)
+    def note(self, frame, event, argument) -> None:
+        code = frame.f_code
+        if code.co_filename.startswith(self.package):
+            self.called.add((code.co_filename, code.co_firstlineno))
 
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_setup(self, item):
+        # What fixtures call is called for all tests of the file that come later.
+        self.called = set()
+        sys.settrace(self.note)
+        threading.settrace(self.note)
+        result = yield
+        self.shared |= self.called
+        return result
 
-def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr, str, str]]:
-    """Expressions, what kind of mistake, and what is written instead."""
-    for node in _computing(tree):
-        match node:
-            case ast.Name(id=name) if name in DROPPED_NAMES and isinstance(node.ctx, ast.Load):
-                yield node, "rounding", DROPPED_NAMES[name]
-            case ast.Call(func=ast.Name(id="round_up" | "round_down"), args=[inner]):
-                yield node, "rounding", f"({ast.unparse(inner)})"
-                yield node.func, "rounding", SWAPPED_NAMES[node.func.id]
-            case ast.Call(func=ast.Name(id=name)) if name in SWAPPED_NAMES:
-                yield node.func, "choice", SWAPPED_NAMES[name]
-            case ast.Call(func=ast.Attribute(attr=name) as called) if name in SWAPPED_NAMES:
-                yield called, "choice", f"{_wrapped(called.value)}.{SWAPPED_NAMES[name]}"
-            case ast.Compare(ops=[op], left=left, comparators=[right]) if type(op) in COMPARED:
-                yield node, "comparison", f"({_wrapped(left)} {COMPARED[type(op)]} {_wrapped(right)})"
-            case ast.BinOp(op=ast.Add() | ast.Sub() as op, left=left, right=right):
-                if _is_text(left) or _is_text(right):
-                    continue
-                other = "-" if isinstance(op, ast.Add) else "+"
-                yield node, "sign", f"({_wrapped(left)} {other} {_wrapped(right)})"
-                if isinstance(right, ast.Constant) and right.value == 1:
-                    yield right, "index", "2" if isinstance(op, ast.Add) else "0"
-            case ast.UnaryOp(op=ast.USub(), operand=operand) if not isinstance(operand, ast.Constant):
-                yield node, "sign", _wrapped(operand)
-            case ast.Subscript(slice=slice_):
-                for index in _indices(slice_):
-                    yield index, "index", str(_number(index) + 1 if _number(index) >= 0 else _number(index) - 1)
-            case _:
-                pass
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_teardown(self, item):
+        sys.settrace(None)
+        threading.settrace(None)
+        names = sorted(f"{file.removeprefix(self.inside)}:{line}" for file, line in self.called | self.shared)
+        self.costs[item.nodeid] = (time.process_time() - self.began, names)
+        self.began = time.process_time()
+        return (yield)
 
 
-def _computing(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that compute, outermost first: no annotations, decorators, texts, complaints or documentation."""
-    skipped = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom)
-    for name, value in ast.iter_fields(node):
-        if name in ("annotation", "returns", "decorator_list", "bases"):
-            continue
-        for child in value if isinstance(value, list) else [value]:
-            if isinstance(child, ast.AST) and not isinstance(child, skipped):
-                yield child
-                yield from _computing(child)
+class Chosen:
+    """A plugin of pytest that runs the named tests in their order, and notes the first that fails."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.order = {name: i for i, name in enumerate(names)}
+        self.failed = ""
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = sorted((i for i in items if i.nodeid in self.order), key=lambda i: self.order[i.nodeid])
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed and not self.failed:
+            self.failed = report.nodeid
 
 
-def _indices(node: ast.expr) -> Iterator[ast.expr]:
-    """Whole numbers in an index."""
-    parts = [node.lower, node.upper] if isinstance(node, ast.Slice) else [node]
-    for part in parts:
-        if isinstance(part, ast.Tuple):
-            for element in part.elts:
-                yield from _indices(element)
-        elif part is not None and _number(part) is not None:
-            yield part
+class Bench:
+    """A copy of the project in which mutants run, and what its tests cost.
+
+    Args:
+        folder: where the copy goes.
+        costs: log of what the tests cost.
+        budget: of the tests that call a function the cheapest run, up to so many seconds of processor time.
+    """
+
+    def __init__(self, folder: Path, costs: Path, budget: float) -> None:
+        self.folder, self.budget = folder, budget
+        for name in COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(source, folder / name)
+        compileall.compile_dir(str(folder / PACKAGE), quiet=1)
+        for name in WARM.split():
+            importlib.import_module(name)
+        phases = set(hypothesis.Phase) - {hypothesis.Phase.shrink, hypothesis.Phase.explain}
+        hypothesis.settings.register_profile("mutants", phases=phases)
+        self.costs = self._measured(costs)
+
+    def _measured(self, path: Path) -> dict[str, Cost]:
+        """The cost of every test, measured file by file where the log of costs does not have it yet."""
+        known = {e["file"]: e["tests"] for e in map(json.loads, path.read_text().splitlines())} if path.exists() else {}
+        files = [f for part in TESTS for f in sorted((self.folder / "tests" / part).rglob("test_*.py"))]
+        for file in files:
+            name = file.relative_to(self.folder).as_posix()
+            if file.name in SLOW or name in known:
+                continue
+            recorder = Recorder(self.folder)
+
+            def work(recorder=recorder, name=name) -> dict:
+                recorder.began = time.process_time()
+                code = int(pytest.main([*OPTIONS, name], plugins=[recorder]))
+                return {"code": code, "tests": recorder.costs}
+
+            told = self._forked(work, limit=600.0)
+            if told.get("code") not in (0, 5):
+                raise SystemExit(f"{name} fails without any mutant: {str(told)[-2000:]}")
+            known[name] = told["tests"]
+            with path.open("a", encoding="utf-8") as log:
+                log.write(json.dumps({"file": name, "tests": told["tests"]}) + "\n")
+            total = sum(seconds for seconds, _ in told["tests"].values())
+            print(f"{name}: {len(told['tests'])} tests, {total:.1f} s", flush=True)
+        return {n: Cost(s, frozenset(c)) for tests in known.values() for n, (s, c) in tests.items()}
+
+    def tests_of(self, mutant: Mutant) -> list[str]:
+        """Tests that call the function of the mutant, or for what is in no function any of its module: those of the
+        file that mirrors the module first, then file by file, the cheapest first, as long as the budget allows.
+        """
+        lines = _function_around(self.folder / mutant.file, mutant.line)
+        called = {f"{mutant.file}:{line}" for line in lines}
+        if lines:
+            names = [name for name, cost in self.costs.items() if cost.called & called]
+        else:
+            begin = f"{mutant.file}:"
+            names = [name for name, cost in self.costs.items() if any(c.startswith(begin) for c in cost.called)]
+        files: dict[str, list[str]] = {}
+        for name in names:
+            files.setdefault(name.split("::")[0], []).append(name)
+        mirror = f"test_{Path(mutant.file).stem}.py"
+
+        def order(file: str) -> tuple[bool, float]:
+            return not file.endswith(f"/{mirror}"), sum(self.costs[name].seconds for name in files[file])
+
+        chosen: list[str] = []
+        left = self.budget
+        for file in sorted(files, key=order):
+            for name in files[file]:
+                if self.costs[name].seconds <= left:
+                    left -= self.costs[name].seconds
+                    chosen.append(name)
+        return chosen
+
+    def outcome(self, mutant: Mutant) -> dict[str, object]:
+        """Whether the tests notice a mutant, and how long that took."""
+        tests, path = self.tests_of(mutant), self.folder / mutant.file
+        if not tests:
+            return {"result": "survived", "by": "no test calls it", "tests": 0, "seconds": 0.0}
+        source = path.read_text(encoding="utf-8")
+        for stale in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
+            stale.unlink()
+        path.write_text(mutant.applied(source), encoding="utf-8")
+        began = time.monotonic()
+
+        def work() -> dict:
+            plugin = Chosen(tests)
+            files = dict.fromkeys(name.split("::")[0] for name in tests)
+            code = int(pytest.main(["-x", *OPTIONS, *files], plugins=[plugin]))
+            return {"code": code, "failed": plugin.failed}
+
+        usual = sum(self.costs[name].seconds for name in tests)
+        try:
+            told = self._forked(work, limit=TOLERANCE * usual + 30.0)
+        finally:
+            path.write_text(source, encoding="utf-8")
+        match told.get("code"):
+            case 0:
+                result = "survived"
+            case 1 | 2 | 3:
+                result = "killed"
+            case None:
+                result = "timeout" if told["signal"] in (signal.SIGXCPU, signal.SIGKILL) else "killed"
+            case code:
+                raise SystemExit(f"pytest ends with {code}: {told['said'][-2000:]}")
+        by = told.get("failed") or (f"signal {told['signal']}" if told.get("code") is None else "it does not import")
+        return {
+            "result": result,
+            "by": "" if result == "survived" else by,
+            "tests": len(tests),
+            "seconds": round(time.monotonic() - began, 1),
+        }
+
+    def _forked(self, work: Callable[[], dict], *, limit: float) -> dict:
+        """What a child process says in the end: its dictionary and, under ``said``, what it printed. Without ``code``
+        it was stopped by a ``signal``: by its processor time above all, since the machine may be busy.
+        """
+        with tempfile.TemporaryDirectory(prefix="run-", dir=self.folder) as place:
+            output, answer = Path(place, "output"), Path(place, "answer")
+            sys.stdout.flush()
+            child = os.fork()
+            if child == 0:
+                try:
+                    os.setsid()
+                    resource.setrlimit(resource.RLIMIT_CPU, (int(limit) + 1, int(limit) + 5))
+                    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+                    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+                    descriptor = os.open(output, os.O_CREAT | os.O_WRONLY)
+                    os.dup2(descriptor, 1)
+                    os.dup2(descriptor, 2)
+                    os.chdir(self.folder)
+                    sys.path[:0] = [str(self.folder), str(self.folder / "benchmarks")]
+                    os.environ["PYTHONPATH"] = str(self.folder)
+                    os.environ["TMPDIR"] = tempfile.tempdir = place
+                    told = work()
+                    source = sys.modules[PACKAGE].__file__ if PACKAGE in sys.modules else str(self.folder)
+                    if not source.startswith(str(self.folder)):
+                        told = {"code": 99}
+                    answer.write_text(json.dumps(told), encoding="utf-8")
+                except BaseException:
+                    traceback.print_exc()
+                finally:
+                    sys.stdout.flush()
+                    os._exit(0)
+            status, deadline = None, time.monotonic() + 12 * limit + 60
+            while status is None:
+                done, code = os.waitpid(child, os.WNOHANG)
+                if done:
+                    status = code
+                elif time.monotonic() > deadline:
+                    os.killpg(child, signal.SIGKILL)
+                    deadline += 60
+                else:
+                    time.sleep(0.05)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGKILL)
+            said = output.read_text(encoding="utf-8", errors="replace") if output.exists() else ""
+            if not answer.exists():
+                return {"signal": os.WTERMSIG(status), "said": said}
+            return json.loads(answer.read_text(encoding="utf-8")) | {"said": said}
 
 
-def _number(node: ast.expr) -> int | None:
-    try:
-        value = ast.literal_eval(node)
-    except (ValueError, TypeError):
-        return None
-    return value if type(value) is int else None
+OPTIONS = (
+    "-q",
+    "--no-header",
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "no:xdist",
+    "--hypothesis-seed=0",
+    "--hypothesis-profile=mutants",
+    "-W",
+    "ignore::pytest.PytestAssertRewriteWarning",
+)
 
 
-def _is_text(node: ast.expr) -> bool:
-    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+def _function_around(path: Path, line: int) -> range:
+    """The lines of the outermost function that a line is in, its decorators with it; none outside of functions."""
+    for node in _functions(ast.parse(path.read_text(encoding="utf-8"))):
+        first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+        if first <= line <= node.end_lineno:
+            return range(first, node.end_lineno + 1)
+    return range(0)
 
 
-def _wrapped(node: ast.expr) -> str:
-    return f"({ast.unparse(node)})"
+def _functions(tree: ast.AST) -> Iterable[ast.FunctionDef]:
+    """Functions and methods, outermost only."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef):
+            yield node
+        else:
+            yield from _functions(node)
 
 
 def all_mutants(only: str = "") -> list[Mutant]:
@@ -197,79 +337,14 @@ def all_mutants(only: str = "") -> list[Mutant]:
         path = ROOT / PACKAGE / part
         for module in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             file = module.relative_to(ROOT).as_posix()
-            if only in file:
+            if only in file and not file.startswith(tuple(f"{PACKAGE}/{p}" for p in LEFT_OUT)):
                 for mutant in mutants_of(module, file):
                     found.setdefault(mutant.key, mutant)
     return list(found.values())
 
 
-def tests_of(file: str) -> tuple[str, ...]:
-    """The tests that have to notice: those of the longest path that the module lies below, its own first."""
-    inside = file.removeprefix(f"{PACKAGE}/")
-    best = max((p for p in TESTS if inside.startswith(p)), key=len)
-    mirror = f"tests/{Path(inside).parent}/test_{Path(inside).stem}.py"
-    own = [mirror] if (ROOT / mirror).exists() else []
-    return tuple(dict.fromkeys([*own, *(t for t in TESTS[best] if (ROOT / t).exists())]))
-
-
-class Bench:
-    """A copy of the project in which mutants run.
-
-    Attributes:
-        folder: of the copy.
-        seconds: how long the tests of a module take without a mutant, by their names.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.seconds = folder, {}
-        for name in COPIED:
-            source = ROOT / name
-            if source.is_dir():
-                shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-            else:
-                shutil.copy(source, folder / name)
-
-    def outcome(self, mutant: Mutant) -> dict[str, object]:
-        """Whether the tests notice a mutant, and how long that took."""
-        tests, path = tests_of(mutant.file), self.folder / mutant.file
-        usual = self._usual(tests)
-        source = path.read_text(encoding="utf-8")
-        path.write_text(mutant.applied(source), encoding="utf-8")
-        began = time.monotonic()
-        try:
-            failed, said = self._run(tests, TOLERANCE * usual + 30.0)
-        finally:
-            path.write_text(source, encoding="utf-8")
-        result = "survived" if not failed else "timeout" if failed == "timeout" else "killed"
-        return {"result": result, "by": said, "seconds": round(time.monotonic() - began, 1)}
-
-    def _usual(self, tests: tuple[str, ...]) -> float:
-        if tests not in self.seconds:
-            began = time.monotonic()
-            failed, said = self._run(tests, 3600.0)
-            if failed:
-                raise SystemExit(f"{' '.join(tests)} fail without any mutant: {said}")
-            self.seconds[tests] = time.monotonic() - began
-        return self.seconds[tests]
-
-    def _run(self, tests: tuple[str, ...], limit: float) -> tuple[str, str]:
-        """``""``, ``"failed"`` or ``"timeout"``, and the first test that failed."""
-        command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", *tests]
-        environment = os.environ | {"PYTHONPATH": str(self.folder), "OMP_NUM_THREADS": "1"}
-        try:
-            done = subprocess.run(
-                command, cwd=self.folder, env=environment, capture_output=True, text=True, timeout=limit, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return "timeout", ""
-        if done.returncode == 0:
-            return "", ""
-        first = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-        return "failed", (first[0] if first else f"exit code {done.returncode}")[:200]
-
-
 def read_log(path: Path) -> dict[str, dict]:
-    """Finished mutants by key."""
+    """Finished mutants by key; of one that ran twice the last."""
     if not path.exists():
         return {}
     return {entry["key"]: entry for entry in map(json.loads, path.read_text(encoding="utf-8").splitlines())}
@@ -286,7 +361,7 @@ def report(entries: dict[str, dict]) -> list[str]:
             for name in sorted(counts)
         ]
     for e in sorted(survivors, key=lambda e: (e["file"], e["line"])):
-        lines.append(f"survived: {e['file']}:{e['line']} {e['kind']}: {e['text']}  ->  {e['new']}")
+        lines.append(f"survived: {e['file']}:{e['line']} {e['kind']}: {e['text']}  ->  {e['new']}  [{e['by']}]")
     return lines
 
 
@@ -302,11 +377,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="which ones")
     parser.add_argument("--only", default="", help="part of the names of the files, e.g. checker")
     parser.add_argument("--log", type=Path, default=Path("mutation.jsonl"), help="lines of JSON, one a mutant")
+    parser.add_argument("--again", action="store_true", help="run the survivors in the log once more, and only them")
+    parser.add_argument("--budget", type=float, default=40.0, help="seconds of tests a mutant, as measured once")
     parser.add_argument("--list", action="store_true", help="list the chosen mutants, run nothing")
     parser.add_argument("--report", action="store_true", help="say what the log says, run nothing")
     options = parser.parse_args()
+    known = read_log(options.log)
     if options.report:
-        print("\n".join(report(read_log(options.log))))
+        print("\n".join(report(known)))
         return
     chosen = all_mutants(options.only)
     if options.sample:
@@ -315,9 +393,12 @@ def main() -> None:
         print("\n".join(f"{m.file}:{m.line} {m.kind}: {m.text}  ->  {m.new}" for m in chosen))
         print(f"{len(chosen)} mutants")
         return
-    known = read_log(options.log)
+    if options.again:
+        alive = {key for key, entry in known.items() if entry["result"] == "survived"}
+        chosen = [m for m in all_mutants(options.only) if m.key in alive]
+        known = {}
     with tempfile.TemporaryDirectory(prefix="sagemp-mutation-") as folder:
-        bench = Bench(Path(folder))
+        bench = Bench(Path(folder).resolve(), options.log.with_suffix(".costs.jsonl"), options.budget)
         for number, mutant in enumerate(chosen, start=1):
             if mutant.key in known:
                 continue
@@ -326,7 +407,7 @@ def main() -> None:
                 log.write(json.dumps(known[mutant.key]) + "\n")
             told = known[mutant.key]
             where = f"{mutant.file}:{mutant.line} {mutant.kind}"
-            print(f"{number}/{len(chosen)} {told['result']} in {told['seconds']} s: {where}", flush=True)
+            print(f"{number}/{len(chosen)} {told['result']} in {told['seconds']} s: {where} [{told['by']}]", flush=True)
     print("\n".join(report({m.key: known[m.key] for m in chosen})))
 
 

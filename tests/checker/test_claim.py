@@ -96,6 +96,8 @@ def test_where_w_is_not_added_as_a_multiple_is_not_said_to_be():
     assert disturbed(program(line("mul", 0, 1), next=2)) is None
     assert disturbed(program(line("sin", 1), line("add", 0, 2), next=3)) is None
     np.testing.assert_array_equal(disturbed(program(line("neg", 0), next=2)), np.zeros((2, 1)))
+    alike = program(line("identity", 1), line("add", 0, 2), next=3)
+    np.testing.assert_array_equal(disturbed(alike), [[1.0], [1.0]])
     scaled = program(line("constant", constants=[3.0]), line("mul", 1, 2), line("add", 0, 3), next=4)
     np.testing.assert_array_equal(disturbed(scaled), [[3.0], [3.0]])
 

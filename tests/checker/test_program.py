@@ -39,6 +39,7 @@ from .by_hand import line, program
         ([line("pow", 0, constants=[0.5])], "it needs a whole exponent but 0 and 1, found 0.5"),
         ([line("pow", 0, constants=[1.0])], "it needs a whole exponent but 0 and 1, found 1.0"),
         ([line("pow", 0, constants=[1e300])], "it needs a whole exponent"),
+        ([line("pow", 0, constants=[2.0**31])], "it needs a whole exponent"),
         ([line("leaky_relu", 0, constants=[1.5])], "it needs a slope of at most 1, found 1.5"),
         ([line("softplus", 0, constants=[0.0, 20.0])], "it needs a positive beta, found 0.0"),
         ([line("elu", 0, constants=[2.0])], "it needs an alpha of 1, found 2.0"),

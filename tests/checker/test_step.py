@@ -106,6 +106,8 @@ NONLINEAR = {
     "maximum": [line("neg", X), line("maximum", 2, X)],
     "minimum": [*PAIRS, line("minimum", X, 3)],
     "maximum with numbers": [line("constant", constants=[0.1]), line("maximum", X, 2)],
+    "maximum with numbers below 0": [line("constant", constants=[-0.3]), line("maximum", X, 2)],
+    "minimum with numbers below 0": [line("constant", constants=[-0.3]), line("minimum", X, 2)],
     "numbers' minimum": [line("constant", constants=[1.2, 0.1]), line("minimum", 2, X)],
     "atan2": [*PAIRS, line("atan2", 3, 2), line("join", 4, 4)],
     "atan2 of w": [line("add", X, W), line("atan2", X, 2), line("pick", 3, entries=[0, 0])],
@@ -130,6 +132,18 @@ def test_a_recorded_radius_that_is_too_small_is_found_out(name):
     made = program(*NONLINEAR[name], next=1 + len(NONLINEAR[name]))
     with pytest.raises(Unproved, match="a recorded relaxation of '.*' is wrong"):
         bounds(made, record_of(made, Entry(0.3, 0.1, 1e-6)))
+
+
+@pytest.mark.parametrize("kind", ["maximum", "minimum"])
+@pytest.mark.parametrize("number", [-0.3, 0.0, 0.3])
+def test_a_limit_takes_the_room_that_its_kink_needs_and_no_more(kind, number):
+    made = program(line("pick", X, entries=[1]), line("constant", constants=[number]), line(kind, 2, 3),
+                   line("join", 4, 4), next=5)  # fmt: skip
+    x = np.linspace(-0.5, 0.5, 101)
+    excess = getattr(np, kind)(x, number) - 0.3 * x
+    middle, radius = 0.5 * (excess.max() + excess.min()), 0.5 * np.ptp(excess)
+    found = bounds(made, [Entry(0.3, middle, 1e3)])
+    np.testing.assert_allclose(found, [[middle - 0.15 - radius, middle + 0.15 + radius]] * 2, atol=1e-9)
 
 
 def test_a_wrong_scale_of_a_product_is_refused():

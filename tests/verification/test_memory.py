@@ -11,7 +11,10 @@ from sagemp_cli.errors import ResourceError
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
+from sagemp_cli.reachability.propagator import LoopSize
 from sagemp_cli.scenes import Scene
 from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellProver, Chunk
@@ -98,6 +101,15 @@ def test_reduced_symbols_take_less_and_longer_horizons_more():
     assert short.working < reduced.working < 0.3 * long.working
     assert 8 * short.working < long.working < 13 * short.working  # and a bit per generator and step
     assert short.kept < 0.15 * long.kept
+
+
+def test_a_backward_sweep_counts_what_each_row_takes_and_intervals_what_each_variable_does():
+    size = LoopSize(steps=500, states=4, disturbances=3, entries=20, widest=8)
+    few, many = (Crown(rows=rows).footprint(size).working for rows in (1000, 2000))
+    assert many - few == 8 * 1000 * (2 * 27 + 3 * 8 + 2 * 4)
+    assert few > Affine().footprint(size).working
+    intervals = Interval().footprint(size)
+    assert intervals.kept == 8 * 2 * 501 * 4 and intervals.working == 8 * 40 * 27 + 2 * intervals.kept
 
 
 @pytest.mark.parametrize(("symbols", "above"), [(30, 1.02), (None, 1.1)])

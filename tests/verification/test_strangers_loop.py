@@ -110,6 +110,11 @@ def test_an_adaptive_partition_splits_until_it_is_proved_and_covers_the_start():
     assert bool(inside.any(1).all())
 
 
+def test_a_claim_that_a_rollout_from_the_centre_breaks_is_split_no_further():
+    proof = proved(claim_of(workspace=([-2.0, -0.5], [2.0, 0.5])), counts=None)
+    assert proof.answer is Answer.FALSIFIED and len(proof.verification.cells.lower) == 1
+
+
 def test_steps_that_differ_are_bounded_each_by_its_own_program():
     def varying(k, x, w):
         return spiral(x, w) + (0.5 if k == 3 else 0.0)

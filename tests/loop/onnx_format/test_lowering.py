@@ -62,6 +62,9 @@ def one_layer(op, rng):
             nodes = [node("Reshape", ["x", "s"], ["r"]), node("MatMul", ["r", "w"], ["y"])]
             constants = {"s": np.array([-1, 3]), "w": w.T.copy()}
             return nodes, constants, {"shape": [1, 6], "outputs": [2, 5]}
+        case "Reshape to more dimensions":
+            nodes = [node("Reshape", ["x", "s"], ["r"]), node("Transpose", ["r"], ["t"]), node("Relu", ["t"], ["y"])]
+            return nodes, {"s": np.array([0, 2, 3])}, {"shape": [1, 6], "outputs": [3, 2, 1]}
         case "Transpose":
             nodes = [node("Transpose", ["x"], ["t"], perm=[1, 0]), node("MatMul", ["t", "w"], ["y"])]
             return nodes, {"w": f32(rng, 2, 5)}, {"shape": [2, 3], "outputs": [3, 5]}
@@ -121,7 +124,8 @@ def one_layer(op, rng):
 
 
 LAYERS = """Gemm|Gemm without transB, nor offsets|MatMul and Add|MatMul of rows|Conv of all|Conv of one
-Sub, Conv, Flatten|Flatten at the front|Reshape|Transpose|Transpose of weights|Cast and Identity|Constant
+Sub, Conv, Flatten|Flatten at the front|Reshape|Reshape to more dimensions|Transpose|Transpose of weights
+Cast and Identity|Constant
 Clip by attributes|Clip|Clip above only|LeakyRelu|LeakyRelu by default|PRelu|Add|Sub|Mul|Div|Sub from a constant
 Add a column|Add two values|Mul two values|Sub two values|Div two values|Mul by one of its entries
 Relu|Tanh|Sigmoid|Softplus|Elu""".replace("\n", "|").split("|")
@@ -172,6 +176,13 @@ def test_weights_are_the_stored_float32_numbers_and_sums_are_not_rounded_to_floa
     assert alone.item() == float(tenth) != 0.1
     twice = read_network(path)(torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64))
     assert twice.item() == 2 * float(most)
+
+
+@pytest.mark.parametrize(("to", "number"), [(1, 0.25), (1, np.float32(0.1)), (11, 0.1), (11, np.float32(0.1))])
+def test_a_cast_of_weights_that_rounds_nothing_leaves_them_as_they_are(to, number, saved):
+    nodes = [node("Cast", ["w"], ["c"], to=to), node("MatMul", ["x", "c"], ["y"])]
+    path = saved(nodes, {"w": np.array([[number]])}, shape=[1, 1], outputs=[1, 1])
+    assert read_network(path)(torch.ones(1, dtype=torch.float64)).item() == float(number)
 
 
 W = np.eye(3, dtype=np.float32)
@@ -228,8 +239,20 @@ REFUSED = {
     "slopes that differ": ([node("PRelu", ["x", "w"], ["y"])], {"w": np.float32([0.1, 0.2, 0.3])}, {}, "slope"),
     "NaN as a limit": ([node("Clip", ["x"], ["y"], min=float("nan"))], {}, {"opset": 10}, "clamp cannot have"),
     "arithmetic on constants": ([node("Add", ["w", "w"], ["y"])], {"w": W}, {}, "two constants"),
+    "weights that a cast rounds": (
+        [node("Cast", ["w"], ["c"], to=1), node("MatMul", ["x", "c"], ["y"])],
+        {"w": 0.1 * np.eye(3)},
+        {},
+        "'Cast' that rounds a constant",
+    ),
     "another type": ([node("Cast", ["x"], ["y"], to=10)], {}, {}, "'Cast' to another type"),
     "a shape that is computed": ([node("Reshape", ["x", "x"], ["y"])], {}, {}, "whose shape is no constant"),
+    "a size that is not there": (
+        [node("Reshape", ["x", "s"], ["y"])],
+        {"s": np.array([1, 3, 0])},
+        {},
+        r"from shape \[1, 3\] to \[1, 3, 0\]",
+    ),
     "another size": ([node("Reshape", ["x", "s"], ["y"])], {"s": np.array([7])}, {}, r"from shape \[1, 3\] to \[7\]"),
     "far too many weights": (
         [node("Flatten", ["x"], ["h"]), node("Add", ["h", "w"], ["y"])],

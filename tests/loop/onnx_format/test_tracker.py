@@ -166,6 +166,11 @@ def test_a_written_tracker_gives_the_same_controls_by_onnx_itself(ours, tmp_path
     assert 0 < float((rough - expected).abs().max()) <= 1e-5
     number, control = rounding_to_float32(ours)
     assert 0 < number < 1e-6 and 0 < control < 1e-6
+    # The largest change on other random inputs, of the network whose numbers are the rounded ones, is of that size.
+    rounded = OnnxTracker.taken(state_dim=4, control_dim=2, path=str(tmp_path / "single.onnx"))
+    x = 2 * torch.rand(4096, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 1
+    largest = float((rounded.network(x) - as_network(ours)(x)).abs().max())
+    assert 0.5 * largest <= control <= 2 * largest
 
 
 def test_a_written_tracker_read_again_is_the_same_tracker(ours, tmp_path):

@@ -331,3 +331,30 @@ def test_a_value_is_read_in_terms_of_all_symbols_by_its_bounds():
     y = Formed(lambda x, w: x + w, [1.0], [[0.5, -0.25]], [2.0], [0.125])
     assert isinstance(y.value, Value)
     assert float(y.low) == pytest.approx(3 - 0.875, abs=1e-12) and float(y.high) == pytest.approx(3.875, abs=1e-12)
+
+
+SIZED = {
+    "a sine over a period": (lambda x, w: torch.sin(8 * x[0]), [0.0, 0.0]),
+    "a product around 0": (lambda x, w: x[0] * x[1], [0.0, 0.0]),
+    "a product off 0": (lambda x, w: x[0] * x[1], [2.0, -3.0]),
+    "a product with one factor around 0": (lambda x, w: x[0] * x[1], [0.0, 3.0]),
+    "a quotient": (lambda x, w: x[0] / x[1], [0.1, -2.0]),
+    "a quotient that shares": (lambda x, w: (x[0] + x[1]) / x[1], [1.0, 2.0]),
+    "an angle above": (lambda x, w: torch.atan2(x[0], x[1]), [2.0, 0.1]),
+    "an angle to the left": (lambda x, w: torch.atan2(x[0], x[1]), [0.8, -2.0]),
+    "a chain": (lambda x, w: torch.exp(x[0] * torch.cos(3 * x[1])) - torch.tanh(x[1]), [0.3, 0.1]),
+}
+
+
+@pytest.mark.parametrize("name", SIZED)
+@pytest.mark.parametrize("tensors", [False, True])
+def test_the_magnitude_that_rounding_is_counted_by_is_at_least_what_a_value_can_be(name, tensors):
+    y = Formed(SIZED[name][0], SIZED[name][1], DIAGONAL, tensors=tensors)
+    met = [(relaxed.name, relaxed.form) for relaxed in y.frame.relaxed] + [("the result", y.value)]
+    for what, form in met:
+        center, magnitude = (torch.as_tensor(part) for part in form.both)
+        largest = center.abs() + torch.as_tensor(y.frame.radius(form.coefficients))
+        assert bool((magnitude >= largest * (1 - 1e-12)).all()), what
+    for f in (relaxed.factors for relaxed in y.frame.relaxed if relaxed.factors is not None):
+        scaled = f.radius_x * f.scale + f.radius_y / f.scale
+        assert bool((torch.as_tensor(f.magnitude) >= torch.as_tensor(scaled) * (1 - 1e-12)).all())

@@ -161,6 +161,7 @@ def test_what_is_no_program_is_refused_in_one_line(record, message):
         ("leaky_relu", 1.5, "slope 1.5, allowed is at most 1"),
         ("elu", 0.5, "alpha 0.5, allowed is 1"),
         ("pow", 0.5, "exponent 0.5, allowed are whole numbers"),
+        ("pow", 2.0**31, "exponent 2147483648.0, allowed are whole numbers"),
     ],
 )
 def test_constants_that_no_relaxation_is_right_for_are_refused(kind, number, message):
