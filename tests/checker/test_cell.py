@@ -32,8 +32,14 @@ def test_a_control_that_is_the_state_itself_is_proved_within_its_bounds():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"control_upper": np.array([[1.0], [0.49]]) + 1e-12}, "step 1: control 0 is only proved to lie in [-0.5, 0.5]"),
-        ({"tube_upper": np.array([[1.0], [0.5], [0.24]]) + 1e-12}, "step 1: state 0 is only proved to lie in [-0.25, 0.25]"),
+        (
+            {"control_upper": np.array([[1.0], [0.49]]) + 1e-12},
+            "step 1: control 0 is only proved to lie in [-0.5, 0.5]",
+        ),
+        (
+            {"tube_upper": np.array([[1.0], [0.5], [0.24]]) + 1e-12},
+            "step 1: state 0 is only proved to lie in [-0.25, 0.25]",
+        ),
         ({"tube_upper": np.array([[0.9], [0.5], [0.25]])}, "step 0: the tube does not contain the cell"),
         ({"deviation": np.zeros((2, 1))}, "step 0: the program has no deviation"),
     ],

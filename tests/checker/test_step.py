@@ -163,12 +163,13 @@ def test_at_a_point_a_program_does_what_torch_does(name):
         np.testing.assert_allclose([float(v) for v in found], run(made, x[i : i + 1], w[i : i + 1])[0], atol=1e-12)
 
 
-def test_an_angle_whose_point_meets_the_jump_is_only_known_to_be_an_angle():
+@pytest.mark.parametrize("direction", [(0.8, 0.6), (-1.0, 0.0), (-1.0, 1e-3), (-1.0, -1e-3)])
+def test_an_angle_whose_point_meets_the_jump_is_only_known_to_be_an_angle(direction):
     made = program(line("pick", X, entries=[1]), line("constant", constants=[-1.0]), line("atan2", 2, 3),
                    line("join", 4, 4), next=5)  # fmt: skip
     with pytest.raises(Unproved, match="a recorded relaxation of 'atan2' is wrong"):
-        bounds(made, record_of(made, Entry(0.0, 0.0, 3.14)))
-    found = bounds(made, record_of(made, Entry(0.0, 0.0, 3.15)))
+        bounds(made, record_of(made, Entry(0.0, 0.0, 3.14), direction))
+    found = bounds(made, record_of(made, Entry(0.0, 0.0, 3.15), direction))
     np.testing.assert_allclose(found, [[-np.pi, np.pi]] * 2)
 
 

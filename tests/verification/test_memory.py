@@ -112,6 +112,14 @@ def test_a_backward_sweep_counts_what_each_row_takes_and_intervals_what_each_var
     assert intervals.kept == 8 * 2 * 501 * 4 and intervals.working == 8 * 40 * 27 + 2 * intervals.kept
 
 
+@pytest.mark.parametrize(("symbols", "generators"), [(100, 100 + 27), (2, 4 + 1 + 27), (None, 4 + 500 * 27)])
+def test_forward_sets_count_the_generators_that_a_step_may_have(symbols, generators):
+    size = LoopSize(steps=500, states=4, disturbances=3, entries=20, widest=8)
+    found = Affine(symbols=symbols).footprint(size)
+    assert found.kept == 8 * (2 * 501 * 4 + 3 * 500 * 20 + 500 * generators / 64)
+    assert found.working == 8 * (6 * generators * 4 + 12 * 27**2) + 2 * found.kept
+
+
 @pytest.mark.parametrize(("symbols", "above"), [(30, 1.02), (None, 1.1)])
 def test_what_is_kept_is_counted_as_if_no_generator_were_negligible(symbols, above):
     work = prover(Affine(symbols=symbols))

@@ -185,6 +185,14 @@ def test_a_cast_of_weights_that_rounds_nothing_leaves_them_as_they_are(to, numbe
     assert read_network(path)(torch.ones(1, dtype=torch.float64)).item() == float(number)
 
 
+@pytest.mark.parametrize("factor", [-4.0, 0.125])
+def test_a_power_of_two_is_a_factor_of_any_weights(factor, saved):
+    path = saved(
+        [node("Gemm", ["x", "w"], ["y"], alpha=factor)], {"w": np.array([[0.1]])}, shape=[1, 1], outputs=[1, 1]
+    )
+    assert read_network(path)(torch.ones(1, dtype=torch.float64)).item() == factor * 0.1
+
+
 W = np.eye(3, dtype=np.float32)
 GEMM = node("Gemm", ["x", "w"], ["y"])
 REFUSED = {
@@ -239,6 +247,12 @@ REFUSED = {
     "slopes that differ": ([node("PRelu", ["x", "w"], ["y"])], {"w": np.float32([0.1, 0.2, 0.3])}, {}, "slope"),
     "NaN as a limit": ([node("Clip", ["x"], ["y"], min=float("nan"))], {}, {"opset": 10}, "clamp cannot have"),
     "arithmetic on constants": ([node("Add", ["w", "w"], ["y"])], {"w": W}, {}, "two constants"),
+    "a factor that rounds": (
+        [node("Gemm", ["x", "w"], ["y"], alpha=0.7)],
+        {"w": np.eye(3)},
+        {},
+        "'Gemm' with a factor 0.69.* on float64 weights; fold it into them first",
+    ),
     "weights that a cast rounds": (
         [node("Cast", ["w"], ["c"], to=1), node("MatMul", ["x", "c"], ["y"])],
         {"w": 0.1 * np.eye(3)},
@@ -251,7 +265,7 @@ REFUSED = {
         [node("Reshape", ["x", "s"], ["y"])],
         {"s": np.array([1, 3, 0])},
         {},
-        r"from shape \[1, 3\] to \[1, 3, 0\]",
+        r"from \[1, 3\] to \[1, 3, 0\]",
     ),
     "another size": ([node("Reshape", ["x", "s"], ["y"])], {"s": np.array([7])}, {}, r"from shape \[1, 3\] to \[7\]"),
     "far too many weights": (

@@ -89,3 +89,24 @@ def test_a_cell_inside_the_start_box_has_a_tube_inside():
     inner = Interval().propagate(loop, cells, DISTURBANCE)
     assert bool((inner.lower >= outer.lower).all()) and bool((inner.upper <= outer.upper).all())
     assert isinstance(START, Box)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [
+        ([-1.0, -1.0], [1.0, 1.0], (-2.0, 2.0)),  # what is negative in one term is not made up for in the other
+        ([0.0, -1.0], [1.0, 0.0], (0.0, 2.0)),
+        ([-1.0, 0.0], [0.0, 1.0], (-2.0, 0.0)),
+        ([-1.0, -1.0], [0.0, 0.0], (-1.0, 1.0)),
+    ],
+)
+def test_a_sum_of_terms_of_one_sign_does_not_cross_0_and_any_other_does(lower, upper, expected):
+    weight = torch.tensor([[1.0, -1.0]], dtype=torch.float64)
+    program = record(
+        lambda x, w: torch.nn.functional.linear(x, weight) + 0 * x, torch.zeros(2).double(), torch.zeros(1).double()
+    )
+    found = program.run(interval([lower], [upper]), interval([[0.0]], [[0.0]]), evaluate=evaluate).next
+    low, high = float(found.lower[0, 0]), float(found.upper[0, 0])
+    assert low == pytest.approx(expected[0], abs=1e-14) and low <= expected[0]
+    assert high == pytest.approx(expected[1], abs=1e-14) and high >= expected[1]
+    assert (low == 0.0) == (expected[0] == 0.0) and (high == 0.0) == (expected[1] == 0.0)

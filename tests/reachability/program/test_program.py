@@ -156,16 +156,17 @@ def test_what_is_no_program_is_refused_in_one_line(record, message):
 
 
 @pytest.mark.parametrize(
-    ("kind", "number", "message"),
+    ("kind", "numbers", "message"),
     [
-        ("leaky_relu", 1.5, "slope 1.5, allowed is at most 1"),
-        ("elu", 0.5, "alpha 0.5, allowed is 1"),
-        ("pow", 0.5, "exponent 0.5, allowed are whole numbers"),
-        ("pow", 2.0**31, "exponent 2147483648.0, allowed are whole numbers"),
+        ("leaky_relu", [1.5], "slope 1.5, allowed is at most 1"),
+        ("elu", [0.5], "alpha 0.5, allowed is 1"),
+        ("pow", [0.5], "exponent 0.5, allowed are whole numbers"),
+        ("pow", [2.0**31], "exponent 2147483648.0, allowed are whole numbers"),
+        ("softplus", [0.0, 20.0], "beta 0.0, allowed is a positive one"),
     ],
 )
-def test_constants_that_no_relaxation_is_right_for_are_refused(kind, number, message):
+def test_constants_that_no_relaxation_is_right_for_are_refused(kind, numbers, message):
     inputs = Instruction("state", 1), Instruction("disturbance", 1)
-    wrong = Instruction(kind, 1, (0,), (torch.tensor(number, dtype=torch.float64),))
+    wrong = Instruction(kind, 1, (0,), tuple(torch.tensor(v, dtype=torch.float64) for v in numbers))
     with pytest.raises(UsageError, match=message):
         Program((*inputs, wrong), Outputs(2))

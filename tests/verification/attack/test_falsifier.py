@@ -215,6 +215,17 @@ def test_a_disturbance_set_too_narrow_to_know_its_points_proves_nothing():
     assert bool(violations(Along(), x, w, claim(where, wide, wide))[-1, -1])
 
 
+@pytest.mark.parametrize("ulps", range(9))
+def test_points_are_certain_of_what_is_a_point_or_wide_enough_to_have_floats_two_inside(ulps):
+    box = Box(*torch.tensor([[1.0, 0.0], [1.0 + ulps * 2.0**-52, 0.0]], dtype=torch.float64))
+    problem = claim(goal_from(1e9), Box.around([0.0, 0.0], [0.1, 0.1]), box)
+    still = torch.zeros(100, 2, dtype=torch.float64)
+    assert (Replay.of(Along(), torch.zeros(2).double(), still, problem).tube is None) == (0 < ulps < 4)
+    kept = inner(box)
+    moved = 2.0 if ulps >= 4 else 0.0
+    assert float(kept.lower[0] - 1.0) == moved * 2.0**-52 and float(kept.upper[0] - 1.0) == (ulps - moved) * 2.0**-52
+
+
 def test_a_rollout_that_breaks_nothing_is_no_counterexample():
     still = torch.zeros(10, 2, dtype=torch.float64)
     x = torch.zeros(2, dtype=torch.float64)
