@@ -141,12 +141,15 @@ def _fields(record: Any, prefix: str) -> list[dict[str, str]]:
 
 
 def _verdicts(record: Any) -> list[str]:
+    from sagemp_cli.sets.between import moment
+
     tubes = getattr(record, "tubes", None)
     if tubes is None:
         return []
     lines = [str(record.verdict)] if hasattr(record, "verdict") else []
     for i, verdict in enumerate(tubes.verdict):
-        decided = f" at step {tubes.step[i]} ({tubes.constraint[i]})" if tubes.step[i] >= 0 else ""
+        when = moment(int(tubes.step[i]), float(tubes.fraction[i]), record.loop.dt)
+        decided = f" at {when} ({tubes.constraint[i]})" if tubes.step[i] >= 0 else ""
         lines.append(f"reference {i}: {verdict}{decided}")
     return lines
 

@@ -123,20 +123,20 @@ def prove(
             overwrite=overwrite,
             name=name,
         )
-    data = as_data(proof) | {"certificate": str(path), "figure": str(path.with_suffix(".png"))}
+    data = as_data(proof, dt) | {"certificate": str(path), "figure": str(path.with_suffix(".png"))}
     typer.echo(json.dumps(data, indent=2) if as_json else printable("\n".join(as_lines(data))))
     raise typer.Exit(ANSWER_CODES[str(proof.answer)])
 
 
-def as_data(proof: LoopProof) -> dict[str, Any]:
-    """What was found out, as plain data."""
+def as_data(proof: LoopProof, dt: float | None = None) -> dict[str, Any]:
+    """What was found out, as plain data; ``dt``: seconds between samples, if they are known."""
     v, claim, example = proof.verification, proof.claim, proof.counterexample
     verdict = v.verdicts[0]
     clearance = dict(zip(v.constraint_names, v.clearance[0].tolist(), strict=True))
     return {
         "verdict": str(proof.answer),
         "exit_code": ANSWER_CODES[str(proof.answer)],
-        "why": str(verdict),
+        "why": verdict.described(dt),
         "between": str(v.between),
         "holds": v.between.words,
         "horizon": proof.loop.horizon,

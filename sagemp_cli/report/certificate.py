@@ -111,7 +111,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     headline(
         figure,
         f"{_SAYS.get(record.verdict, record.verdict)}",
-        f"{subject(artifact.header)}: {_deciding(tubes)}; {count} reference{'s' * (count > 1)}, "
+        f"{subject(artifact.header)}: {_deciding(tubes, dynamics.dt)}; {count} reference{'s' * (count > 1)}, "
         f"{cells} cell{'s' * (cells > 1)}, K = {horizon} ({horizon * dynamics.dt:g} s), "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; "
         f"{record.falsifier_rollouts} rollouts attacked it{_about_model(record, dynamics)}",
@@ -197,12 +197,13 @@ def _about_model(record: Certificate, dynamics: Dynamics) -> str:
     return f"; {said}, {model} itself: {', '.join(found)} with {len(record.true_model.tubes.cell_reference)} cells"
 
 
-def _deciding(tubes: Tubes) -> str:
+def _deciding(tubes: Tubes, dt: float) -> str:
     """The verdict of the worst reference, in words."""
     words = Between(tubes.between).words
     open_ones = [r for r, v in enumerate(tubes.verdict) if v != "SAFE"]
     if open_ones:
         r = open_ones[0]
-        return f"{tubes.verdict[r]} at {moment(int(tubes.step[r]), float(tubes.fraction[r]))} ({tubes.constraint[r]})"
+        when = moment(int(tubes.step[r]), float(tubes.fraction[r]), dt)
+        return f"{tubes.verdict[r]} at {when} ({tubes.constraint[r]})"
     r, c = np.unravel_index(tubes.clearance.argmin(), tubes.clearance.shape)
     return f"SAFE {words}, passes {tubes.constraint_names[c]} at {tubes.clearance[r, c]:.2f} m or more"

@@ -103,10 +103,11 @@ def draw_loop(tubes: Tubes, setting: LoopSetting, verdict: str, examples: Sequen
     panels[0].set_xlim(times[0], times[-1])
     proof = "rounding included" if tubes.rigorous else "sound in exact arithmetic"
     duration = f" ({steps * setting.dt:g} s)" if setting.dt else ""
+    cells = f"{len(tubes.cell_lower)} cell{'s' * (len(tubes.cell_lower) > 1)}"
     headline(
         figure,
         _SAYS[verdict] + (f": {_aim(setting)}" if verdict == "VERIFIED" else ""),
-        f"{setting.name}: {_deciding(tubes)}; {len(tubes.cell_lower)} cell{'s' * (len(tubes.cell_lower) > 1)}, "
+        f"{setting.name}: {_deciding(tubes, setting.dt)}; {cells}, "
         f"K = {steps}{duration}, {tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}{_when(tubes, setting)}",
         colour=VERDICT_COLOURS.get(verdict, INK),
     )
@@ -125,10 +126,11 @@ def _aim(setting: LoopSetting) -> str:
     return f"every start in X$_I$ {' and '.join(parts)}" if parts else "every rollout stays in this tube"
 
 
-def _deciding(tubes: Tubes) -> str:
+def _deciding(tubes: Tubes, dt: float | None) -> str:
     if tubes.verdict[0] == "SAFE":
         return "SAFE"
-    return f"{tubes.verdict[0]} at {moment(int(tubes.step[0]), float(tubes.fraction[0]))} ({tubes.constraint[0]})"
+    when = moment(int(tubes.step[0]), float(tubes.fraction[0]), dt)
+    return f"{tubes.verdict[0]} at {when} ({tubes.constraint[0]})"
 
 
 def _when(tubes: Tubes, setting: LoopSetting) -> str:

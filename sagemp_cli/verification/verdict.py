@@ -59,10 +59,14 @@ class Verdict:
     constraint: str = ""
     fraction: float = 0.0
 
-    def __str__(self) -> str:
+    def described(self, dt: float | None = None) -> str:
+        """In words, with the time in seconds if that between two samples is known."""
         if self.outcome is Outcome.SAFE:
             return str(self.outcome)
-        return f"{self.outcome} at {moment(self.step, self.fraction)} ({self.constraint})"
+        return f"{self.outcome} at {moment(self.step, self.fraction, dt)} ({self.constraint})"
+
+    def __str__(self) -> str:
+        return self.described()
 
 
 @dataclass(frozen=True)

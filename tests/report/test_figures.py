@@ -124,7 +124,7 @@ def test_a_tube_that_overflows_is_drawn_up_to_there(certificate, tmp_path):
     save_figure(figure, tmp_path / "odd.png")
     title, subtitle = texts(figure)
     assert title.startswith("Unknown")
-    assert "UNBOUNDED at step 12 (px)" in subtitle
+    assert "UNBOUNDED at step 12, 1.2 s (px)" in subtitle
 
 
 def test_a_counterexample_is_drawn(certificate, tmp_path):
