@@ -26,17 +26,26 @@ SLOW = """
     report/test_safety stages/test_own_trackers stages/test_pipeline stages/test_reference_file
     stages/test_resume stages/test_safety_rates stages/test_train_dynamics stages/test_train_planner
     trackers/test_tube_loss verification/executors/test_cluster verification/executors/test_processes
+    cli/test_errors::test_config_validate_checks_every_option
+    reachability/crown/test_blocks::test_many_cells_of_a_wide_network_take_the_memory_of_a_few
+    reachability/test_reach::test_a_first_call_imports_no_symbolic_mathematics
+    reachability/test_reach::test_auto_lirpa_takes_a_strangers_loop
+    reachability/test_reach::test_no_function_of_torch_that_is_given_a_value_kills_the_interpreter
+    storage/test_artifact::test_random_damage_never_escapes_as_anything_but_a_one_line_error
 """
-"""Whole pipelines, trainings, worker processes and campaigns: what ``make test-fast`` leaves out."""
+"""Whole pipelines, trainings, worker processes and campaigns: what ``make test-fast`` leaves out. Files, and of
+others the tests that take seconds each (``pytest --durations=50`` says which)."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of slow files."""
-    root = Path(__file__).parent
-    slow = {root / f"{name}.py" for name in SLOW.split()}
-    assert all(path.is_file() for path in slow), "SLOW names a file that is not there"
+    """Mark the tests of slow files, and slow tests of others."""
+    root, slow = Path(__file__).parent, set(SLOW.split())
+    for name in slow:
+        file, _, test = name.partition("::")
+        assert f"def {test}" in (root / f"{file}.py").read_text(encoding="utf-8"), f"SLOW names no test: {name}"
     for item in items:
-        if item.path in slow:
+        file = item.path.relative_to(root).with_suffix("").as_posix()
+        if file in slow or f"{file}::{item.name.partition('[')[0]}" in slow:
             item.add_marker("slow")
 
 
