@@ -21,12 +21,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 SLOW = """
     checker/test_mutants checker/test_program_mutants cli/test_check cli/test_end_to_end
-    cli/test_every_experiment cli/test_init cli/test_pipeline_commands cli/test_safety_rates
+    cli/test_every_experiment cli/test_init cli/test_own_stage cli/test_pipeline_commands cli/test_safety_rates
     experts/test_parallel planners/test_generative planners/test_planner_training report/test_figures
     report/test_safety stages/test_own_trackers stages/test_pipeline stages/test_reference_file
     stages/test_resume stages/test_safety_rates stages/test_train_dynamics stages/test_train_planner
     trackers/test_tube_loss verification/executors/test_cluster verification/executors/test_processes
     cli/test_errors::test_config_validate_checks_every_option
+    reachability/continuous/test_reach::test_what_escapes_within_a_period_ends_the_tube_there_and_says_so
     reachability/crown/test_blocks::test_many_cells_of_a_wide_network_take_the_memory_of_a_few
     reachability/test_reach::test_a_first_call_imports_no_symbolic_mathematics
     reachability/test_reach::test_auto_lirpa_takes_a_strangers_loop

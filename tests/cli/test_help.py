@@ -73,12 +73,7 @@ def test_help_imports_nothing_heavy_and_comes_at_once():
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ("status",),
-        ("status", "experiment=unicycle_vlm_avoid", "sources.train-tracker=kinematic_node"),
-        ("config", "list"),
-        ("config", "show"),
-    ],
+    [("status", "experiment=unicycle_vlm_avoid", "sources.train-tracker=kinematic_node"), ("config", "list")],
     ids=" ".join,
 )
 def test_what_only_looks_at_files_and_configs_imports_no_mathematics(arguments, tmp_path):
