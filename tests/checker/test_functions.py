@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagemp_cli.checker.balls import Unproved
-from sagemp_cli.checker.functions import FUNCTIONS, clamp, elu, integer_power, leaky_relu, softplus
+from sagemp_cli.checker.functions import FUNCTIONS, Smooth, clamp, elu, integer_power, leaky_relu, softplus
 
 NAMED = {
     **FUNCTIONS,
@@ -49,6 +49,22 @@ def test_no_point_of_the_graph_lies_outside_and_both_bounds_are_nearly_met(name,
             values.append(float(y))
         coarse = 1e-9 + 1e-2 * (max(values) - min(values)) + 1e-3 * width
         assert float(least) >= min(values) - coarse and float(most) <= max(values) + coarse
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_derivatives_are_those_of_the_value(name):
+    h = arb(2) ** -40
+    pieces = [p for p in NAMED[name].pieces if isinstance(p[1], Smooth)]
+    for begin, curve, end in pieces:
+        for x in (-2.3, -1.4, -0.3, 0.4, 0.6, 1.7, 3.1):
+            if (begin is not None and x <= begin) or (end is not None and x >= end) or (name in POSITIVE and x < 0):
+                continue
+            low, middle, high = (curve.value(arb(x) + side * h) for side in (-1, 0, 1))
+            for found, wanted in (
+                (curve.first, (high - low) / (2 * h)),
+                (curve.second, (high - 2 * middle + low) / h**2),
+            ):
+                assert float(found(arb(x))) == pytest.approx(float(wanted), rel=1e-6, abs=1e-9), x
 
 
 def test_the_bounds_of_sine_over_many_periods_are_those_of_its_extrema():

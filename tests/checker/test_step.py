@@ -117,11 +117,11 @@ NONLINEAR = {
 
 
 @pytest.mark.parametrize("name", NONLINEAR)
-@pytest.mark.parametrize("slope", [0.3, 1.7])
-def test_whatever_is_recorded_every_value_is_enclosed(name, slope):
+@pytest.mark.parametrize(("slope", "offset"), [(0.3, 0.1), (1.7, 9.0), (1.7, -9.0), (-0.8, 9.0), (-0.8, -9.0)])
+def test_whatever_is_recorded_every_value_is_enclosed(name, slope, offset):
     made = program(*NONLINEAR[name], next=1 + len(NONLINEAR[name]))
     assert made.relaxations > 0
-    found = bounds(made, record_of(made, Entry(slope, 0.1, 1e3)))
+    found = bounds(made, record_of(made, Entry(abs(slope) if "product" in str(made.relaxed) else slope, offset, 1e3)))
     values = run(made, *points())
     assert (found[:, 0] - 1e-12 <= values.min(0)).all() and (values.max(0) <= found[:, 1] + 1e-12).all()
     assert np.isfinite(found).all()

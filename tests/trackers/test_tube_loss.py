@@ -65,6 +65,17 @@ def test_a_finer_partition_has_smaller_cells(unicycle, references, start, distur
     assert quarter < whole
 
 
+def test_the_partition_is_that_of_the_states_that_are_uncertain(unicycle, references, disturbance, make_tracker):
+    start = Box.around(references[0, 0], [0.0, 0.2, 0.0, 0.0])
+    whole, tenth = (
+        loss_of(TubeLoss(references=1, counts=[c], steps=2), make_tracker(), unicycle, references, start, disturbance)[
+            0
+        ]
+        for c in (1, 10)
+    )
+    assert tenth < 0.9 * whole
+
+
 def test_the_gradient_agrees_with_finite_differences(unicycle, references, start, disturbance, make_tracker):
     tracker = make_tracker(2)
     loss = TubeLoss(references=2, counts=[1, 1], steps=6)

@@ -358,3 +358,28 @@ def test_the_magnitude_that_rounding_is_counted_by_is_at_least_what_a_value_can_
     for f in (relaxed.factors for relaxed in y.frame.relaxed if relaxed.factors is not None):
         scaled = f.radius_x * f.scale + f.radius_y / f.scale
         assert bool((torch.as_tensor(f.magnitude) >= torch.as_tensor(scaled) * (1 - 1e-12)).all())
+
+
+RELAXED = {
+    "clamp": [lambda x, w: torch.maximum(x, torch.tensor(0.2)), lambda x, w: torch.minimum(torch.tensor(0.2), x)],
+    "relu": [lambda x, w: torch.maximum(x[0], x[1]), lambda x, w: torch.minimum(x[0], x[1]), lambda x, w: x.relu()],
+    "product": [lambda x, w: x[0] * x[1]],
+    "reciprocal": [lambda x, w: 2.0 / x],
+    "reciprocal product": [lambda x, w: x[0] / x[1]],
+    "atan2": [lambda x, w: torch.atan2(x[0], x[1])],
+    "": [lambda x, w: 2.0 * x, lambda x, w: x / 3.0, lambda x, w: torch.cat([x - w, -x])],
+}
+"""Which relaxations a step has, as the specification of programs says."""
+
+
+@pytest.mark.parametrize("names", RELAXED)
+def test_an_operation_has_the_relaxations_of_the_specification(names):
+    for function in RELAXED[names]:
+        found = Formed(function, [2.0, 3.0], DIAGONAL).frame.relaxed
+        assert " ".join(relaxed.name for relaxed in found) == names
+
+
+@pytest.mark.parametrize("function", [lambda x, w: torch.sin(x), lambda x, w: x[0] * x[1], lambda x, w: torch.exp(x)])
+def test_what_is_of_second_order_is_added_to_the_radius_of_a_band(function):
+    (relaxed,) = Formed(function, [1.0, 2.0], DIAGONAL).frame.relaxed
+    assert bool((torch.as_tensor(relaxed.radius) >= torch.as_tensor(relaxed.band.radius) * (1 + 0.999e-9)).all())

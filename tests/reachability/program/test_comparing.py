@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 
 import numpy as np
@@ -36,6 +37,13 @@ HIDDEN = {
     "a threshold": (
         other_than_recorded(
             lambda x: 0.1 * bump(x[..., :1], 0.3337, 1e-5), base=lambda x: 0.5 * torch.clamp(x, max=0.3337)
+        ),
+        {},
+    ),
+    "a threshold of one state only": (
+        other_than_recorded(
+            lambda x: 0.1 * bump(x[..., :1], 0.3337, 1e-5),
+            base=lambda x: 0.5 * torch.clamp(x, max=torch.tensor([0.3337, math.inf], dtype=torch.float64)),
         ),
         {},
     ),

@@ -170,3 +170,22 @@ def test_constants_that_no_relaxation_is_right_for_are_refused(kind, numbers, me
     wrong = Instruction(kind, 1, (0,), tuple(torch.tensor(v, dtype=torch.float64) for v in numbers))
     with pytest.raises(UsageError, match=message):
         Program((*inputs, wrong), Outputs(2))
+
+
+def test_layers_take_a_weight_that_depends_on_the_state_and_a_constant_input():
+    inputs = torch.tensor([[1.0, 2.0], [3.0, -1.0], [0.5, 4.0]]).double()
+
+    def step(x, w):
+        weight = torch.stack([x[:2], x[1:]])
+        both = nn.functional.linear(inputs, weight) + nn.functional.linear(inputs, x[:2])[:, None]
+        return both.sum(0).repeat(2)[:3]
+
+    for x in torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)):
+        torch.testing.assert_close(record(step, X, X).run(x[None], X[None]).next[0], step(x, X))
+
+
+def test_limits_that_are_equal_for_equal_entries_make_one_entry():
+    program = record(lambda x, w: torch.clamp(x[:1].expand(3), *torch.tensor([[-1.0] * 3, [0.1] * 3])), X, X)
+    assert [i.size for i in program.instructions if i.kind == "clamp"] == [1]
+    apart = record(lambda x, w: torch.clamp(x[:1].expand(3), max=torch.tensor([0.1, 0.2, 0.3])), X, X)
+    torch.testing.assert_close(apart.run(X[None], X[None]).next[0], torch.tensor([0.1, 0.2, 0.3]).double())

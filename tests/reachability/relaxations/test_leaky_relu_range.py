@@ -17,3 +17,9 @@ def test_the_range_holds_every_value(slope):
     values = torch.nn.functional.leaky_relu(points, slope)
     assert bool((low <= values.amin(0)).all()) and bool((values.amax(0) <= high).all())
     assert bool((high - values.amax(0) < 1e-12).all()) and bool((values.amin(0) - low < 1e-12).all())
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1, 1.0])
+def test_what_is_not_negative_stays_so_exactly(slope):
+    lower, upper = torch.tensor([0.0, 0.1, 2.0]).double(), torch.tensor([0.0, 1.0, 3.0]).double()
+    assert torch.equal(value_range(lower, upper, slope)[0], lower)

@@ -235,6 +235,14 @@ def test_a_rollout_that_breaks_nothing_is_no_counterexample():
     assert found.fraction == pytest.approx(0.5, abs=1e-6)
 
 
+def test_what_only_touches_a_wall_is_not_the_step_at_which_it_is_broken():
+    """The rollout is on the wall at 0 and a float beyond it from 1 on, which proves nothing."""
+    start, still = Box.around([0.5, 0.0], [1.0, 0.0]), Box.around([0.0, 0.0], [0.0, 0.0])
+    problem = dataclasses.replace(claim(scene(half=1.0), start, still), between=Between.SAMPLES)
+    found = replay(Along(2.0**-52, 10), torch.tensor([1.0, 0.0]).double(), torch.zeros(10, 2).double(), problem)
+    assert found is not None and not found.proved and (found.kind, found.step) == ("workspace", 1)
+
+
 def test_an_overflowing_rollout_is_no_counterexample():
     @dataclass(frozen=True)
     class Explodes:
