@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,15 +19,15 @@ def clearances(safe: SafeSet, lower: np.ndarray, upper: np.ndarray, *, between: 
     Over the whole of every step, in so many parts, unless the samples only are asked for.
     """
     tubes = [samples_of(low, high) for low, high in zip(lower, upper, strict=True)]
-    distances = [] if safe.workspace is None else [lambda box: _inside(box, safe.workspace)]
-    distances += [lambda box, o=o: _apart(box, o) for o in safe.obstacles]
+    distances: list[Callable[[Sides], arb]] = [] if safe.workspace is None else [partial(_inside, safe.workspace)]
+    distances += [partial(_apart, obstacle) for obstacle in safe.obstacles]
     if between == SAMPLES:
         return [smallest([distance(box) for tube in tubes for box in tube]) for distance in distances]
     steps = [pair for tube in tubes for pair in zip(tube[:-1], tube[1:], strict=True)]
     return [_least(steps, distance, parts) for distance in distances]
 
 
-def _least(steps: list[tuple[Sides, Sides]], distance: Any, parts: int) -> arb:
+def _least(steps: list[tuple[Sides, Sides]], distance: Callable[[Sides], arb], parts: int) -> arb:
     """The least distance over the parts of all steps.
 
     One box over a whole step is no farther away than its parts are: a step for which that is not below what is found
@@ -62,14 +64,14 @@ def smallest(values: list[arb]) -> arb:
     return out
 
 
-def _inside(box: Sides, workspace: Corners) -> arb:
+def _inside(workspace: Corners, box: Sides) -> arb:
     low, high = workspace
     sides = [a - ball(c) for a, c in zip(box[0], low, strict=True) if c != -np.inf]
     sides += [ball(c) - b for b, c in zip(box[1], high, strict=True) if c != np.inf]
     return smallest(sides) if sides else arb("inf")
 
 
-def _apart(box: Sides, obstacle: tuple[str, str, list[float], Any]) -> arb:
+def _apart(obstacle: tuple[str, str, list[float], Any], box: Sides) -> arb:
     _, kind, first, second = obstacle
     if kind == "block":
         gaps = [(ball(c) - b).max(a - ball(d)) for a, b, c, d in zip(*box, first, second, strict=True)]

@@ -23,7 +23,7 @@ from sagemp_cli.sets.tube import Tube
 
 PARTS = 8
 """Parts of a step. Ends of parts are multiples of 1/8, which float64 has exactly. With 8 the certified distances of the
-paper's cases are at most 7 mm below those at the samples; one hull of both ends loses up to 57 mm."""
+paper's cases are at most 8 mm below those at the samples; one hull of both ends loses up to 57 mm."""
 
 _GRID = 2.0**30
 """Fractions are multiples of ``1 / _GRID``, of which ``1 - s`` is exact too."""
