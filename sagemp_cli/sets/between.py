@@ -60,6 +60,12 @@ class Bulge:
     swing: Tensor
     rest: Tensor
 
+    @property
+    def known(self) -> Tensor:
+        """Where it bounds anything: numbers that are finite and not negative, ``(..., K, n)``."""
+        parts = (self.curve, self.swing, self.rest)
+        return torch.stack([torch.isfinite(v) & (v >= 0) for v in torch.broadcast_tensors(*parts)]).all(0)
+
 
 def over_steps(tube: Tube, bulge: Bulge | None = None, *, parts: int = PARTS) -> Box:
     """Boxes ``(..., K, parts, n)`` that contain the state over the part ``[i / parts, (i + 1) / parts]`` of step k.
@@ -85,7 +91,7 @@ def over_steps(tube: Tube, bulge: Bulge | None = None, *, parts: int = PARTS) ->
     high = torch.maximum(high[..., :-1, :], high[..., 1:, :])
     if bulge is not None:
         reach = _reach(bulge, parts)
-        known = known & torch.isfinite(reach) & (reach >= 0)
+        known = known & bulge.known[..., None, :] & torch.isfinite(reach)
         low, high = round_down(low - reach), round_up(high + reach)
     return Box(torch.where(known, low, -torch.inf), torch.where(known, high, torch.inf))
 

@@ -181,6 +181,8 @@ class _Measures:
 
 def _measure(tube: Tube, scene: Scene, position: Sequence[int], between: Between, bulge: Bulge | None) -> _Measures:
     finite = torch.isfinite(tube.lower) & torch.isfinite(tube.upper)
+    if bulge is not None:  # a step over which nothing is known ends unbounded
+        finite = torch.cat([finite[..., :1, :], finite[..., 1:, :] & bulge.known], dim=-2)
     everywhere = torch.full_like(tube.lower, torch.inf)
     lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
     index = list(position)
