@@ -71,6 +71,23 @@ def test_its_help_is_its_docstring_and_the_list_of_commands_has_it(documented, s
     assert "│ plan-lengths " in sagemp("--plugin", "plan_lengths.py", "--help").stdout
 
 
+def test_the_plugins_of_a_project_need_no_option(documented, sagemp):
+    Path("conf").mkdir()
+    Path("conf/project.yaml").write_text("plugins: [plan_lengths.py]\n")
+    assert "Measure how far the references of the library go." in sagemp("plan-lengths", "--help").stdout
+    assert "plan-lengths" in states(sagemp("status", "--json", "effort=toy"))
+
+
+def test_a_plugin_that_does_not_load_is_one_line_and_leaves_the_help(documented, sagemp):
+    Path("conf").mkdir()
+    Path("conf/project.yaml").write_text("plugins: [broken_lengths.py]\n")
+    Path("broken_lengths.py").write_text("1 / 0\n")
+    result = sagemp("plan-lengths")
+    assert result.exit_code == 2
+    assert result.stderr == "error: plugin broken_lengths.py: line 1: ZeroDivisionError: division by zero\n"
+    assert "│ verify " in sagemp("--help").stdout
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
