@@ -220,8 +220,6 @@ def comparable(output: str) -> str:
 
 def made(folder: Path, target: str, seed: int) -> tuple[str, str]:
     """Make a mutant, in a process of its own: the HDF5 library meets damaged files there too. Its path, and how."""
-    for name in ("canary", "plan.h5"):
-        os.utime(folder / "outside" / name, (0, time.time()))  # whoever opens it moves the first
 
     def work(report: int) -> None:
         path, how = mutant(Path(), target, random.Random(seed))
@@ -238,6 +236,8 @@ def made(folder: Path, target: str, seed: int) -> tuple[str, str]:
 
 def tried(folder: Path, arguments: list[str], *, fresh: bool) -> dict[str, Any]:
     """Run one command and look at what it did."""
+    for name in ("canary", "plan.h5"):
+        os.utime(folder / "outside" / name, (0, time.time()))  # whoever reads it moves the first
     before = state_of(folder)
     ended = command(arguments, folder, seconds=SECONDS + 30, wall=PATIENCE * SECONDS, fresh=fresh)
     lines = ended.output.splitlines()

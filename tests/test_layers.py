@@ -11,8 +11,8 @@ ROOT = Path(__file__).parent.parent / "sagemp_cli"
 
 LAYERS = (
     ("errors",),
-    ("plugins",),
     ("progress", "workers", "reading"),
+    ("plugins",),
     ("config",),
     ("sets", "storage"),
     ("dynamics", "scenes", "learning"),

@@ -143,17 +143,20 @@ def _store_plugins() -> None:
 
 @functools.cache
 def _search_project_first() -> None:
-    """Make Hydra look into the project's own config folder before the package's."""
+    """Make Hydra look into the project's own config folder before the package's, and read it strictly."""
     from hydra.core.config_search_path import ConfigSearchPath
     from hydra.core.plugins import Plugins
     from hydra.plugins.search_path_plugin import SearchPathPlugin
 
+    from sagemp_cli.config.strict_source import SCHEME, StrictSource
+
     class ProjectFirst(SearchPathPlugin):
         def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
             for folder in reversed(config_folders()[:-1]):
-                search_path.prepend(provider="project", path=f"file://{folder}")
+                search_path.prepend(provider="project", path=f"{SCHEME}://{folder}")
 
     Plugins.instance().register(ProjectFirst)
+    Plugins.instance().register(StrictSource)
 
 
 def _experiment(path: str) -> dict[str, Any]:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TypeGuard
 
-import yaml
-
-from sagemp_cli.errors import ArtifactError, ConfigError, did_you_mean
+from sagemp_cli.errors import ConfigError, did_you_mean
 from sagemp_cli.plugins.project import current_project
-from sagemp_cli.reading.plain_yaml import plain_yaml
-from sagemp_cli.reading.regular import is_there, require_regular
+from sagemp_cli.reading.plain_yaml import yaml_in
+from sagemp_cli.reading.regular import is_there
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -36,9 +34,6 @@ def config_file(group: str, option: str) -> Path | None:
 def is_file(choice: Any) -> TypeGuard[str]:
     """Whether a choice is the path of a file, not a name."""
     return isinstance(choice, str) and choice.endswith((".yaml", ".yml"))
-
-
-_LARGEST_YAML = 1_000_000
 
 
 def load_scene(scene: Any) -> Any:
@@ -67,20 +62,10 @@ def mapping_in(path: Path, what: str) -> dict[str, Any]:
         what: what it is, for messages.
 
     Raises:
-        ConfigError: it is missing, too large, or not plain YAML with a mapping in it.
+        ConfigError: it is missing, too large, or not plain YAML, see :mod:`~sagemp_cli.reading.plain_yaml`, with a
+            mapping in it.
     """
-    try:
-        if require_regular(path, "a file in YAML") > _LARGEST_YAML:
-            raise ConfigError(f"{what}: is larger than {_LARGEST_YAML} bytes")
-        data = plain_yaml(path.read_text(encoding="utf-8"))
-    except ArtifactError as e:
-        raise ConfigError(f"{what}: {str(e).removeprefix(f'{path}: ')}") from None
-    except OSError as e:
-        raise ConfigError(f"{what}: cannot be read ({e.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise ConfigError(f"{what}: not readable as YAML ({first_line(e)})") from None
-    except ValueError as e:
-        raise ConfigError(f"{what}: {e}") from None
+    data = yaml_in(path, what)
     if not isinstance(data, dict):
         raise ConfigError(f"{what}: must hold a mapping, found {type(data).__name__}")
     return data

@@ -53,12 +53,9 @@ def current_project() -> Project:
     path = conf / FILE
     if not path.is_file():
         return Project(folder, conf)
-    import yaml  # here: whoever bounds a loop of his own has no such file
+    from sagemp_cli.reading.plain_yaml import yaml_in  # here: whoever bounds a loop of his own has no such file
 
-    try:
-        said = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
-        raise ConfigError(f"conf/{FILE}: cannot be read as YAML ({' '.join(str(e).split())})") from None
+    said = yaml_in(path, f"conf/{FILE}")
     said = {} if said is None else said
     if not isinstance(said, Mapping):
         raise ConfigError(f"conf/{FILE} must be a mapping with the keys {', '.join(_KEYS)}, found {said!r}")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import yaml
 
+from sagemp_cli.errors import ArtifactError, ConfigError
+from sagemp_cli.reading.regular import require_regular
+
 LONGEST = 100_000
 """Characters; the configs of this project have about 4,000."""
+_LARGEST = 1_000_000
 DEEPEST = 100
 """Levels of lists and mappings in each other; theirs have about 5."""
 
@@ -77,3 +82,35 @@ def plain_yaml(text: str) -> Any:
     if len(text) > LONGEST:
         raise ValueError(f"it has {len(text)} characters, more than {LONGEST}")
     return yaml.load(text, Loader=_Plain)
+
+
+def yaml_in(path: Path, what: str) -> Any:
+    """What a file says, see :func:`plain_yaml`; None of an empty one.
+
+    Args:
+        path: the file.
+        what: what it is, for messages.
+
+    Raises:
+        ConfigError: one line: it is missing, no regular file, too large, or no such YAML.
+    """
+    try:
+        if require_regular(path, "a file in YAML") > _LARGEST:
+            raise ConfigError(f"{what}: is larger than {_LARGEST} bytes")
+        return plain_yaml(path.read_text(encoding="utf-8"))
+    except ArtifactError as e:
+        raise ConfigError(f"{what}: {str(e).removeprefix(f'{path}: ')}") from None
+    except OSError as e:
+        raise ConfigError(f"{what}: cannot be read ({e.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as e:
+        raise ConfigError(f"{what}: not readable as YAML ({_said(e)})") from None
+    except ValueError as e:
+        raise ConfigError(f"{what}: {e}") from None
+
+
+def _said(error: Exception) -> str:
+    """What is wrong, and in which line."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is None:
+        return " ".join(str(error).split())
+    return f"line {mark.line + 1}: {' '.join(str(getattr(error, 'problem', error)).split())}"

@@ -129,18 +129,24 @@ def read_artifact(path: Path, record: type[R]) -> Artifact[R]:
     """Read a file as an artifact of one kind; the file is untrusted input.
 
     Raises:
-        ArtifactError: missing, not HDF5, cut off, of another kind, of a newer format, or not as declared.
+        ArtifactError: missing, not HDF5, cut off, of another kind, of a newer format, not as declared, or not what was
+            written, see :attr:`Artifact.unchanged`.
         NonFiniteError: NaN or infinity where the declaration allows none.
     """
     wanted, (tree, sha256) = kind_of(record), read_tree(path)
     kind, header = _header(tree, path)
     if kind != wanted:
         raise ArtifactError(f"{path}: is an artifact of kind '{kind.name}', '{wanted.name}' is needed here")
-    return _artifact(path, sha256, kind, header, tree)
+    artifact = _artifact(path, sha256, kind, header, tree)
+    if not artifact.unchanged:
+        raise ArtifactError(
+            f"{path}: the content was changed after it was written (its hash differs); make it again with --overwrite"
+        )
+    return artifact
 
 
 def read_any_artifact(path: Path) -> tuple[Kind, Artifact[Any]]:
-    """Read a file as an artifact of the kind that it says it is of, see :func:`read_artifact`."""
+    """Read a file as an artifact of the kind that it says it is of, see :func:`read_artifact`, changed or not."""
     tree, sha256 = read_tree(path)
     kind, header = _header(tree, path)
     return kind, _artifact(path, sha256, kind, header, tree)

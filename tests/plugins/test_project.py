@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import pytest
@@ -52,6 +53,43 @@ def test_files_of_the_project_go_before_those_of_the_package(folder):
     assert compose(["experiment=unicycle_node"])["name"] == "unicycle_node"
 
 
+TWO_MEANINGS = [
+    ("budget: 010", "'010' can be read in two ways"),
+    ("budget: 1:30", "'1:30' can be read in two ways"),
+    ("budget: yes", "'yes' can be read in two ways"),
+    ("budget: 2\nbudget: 3", "the key 'budget' is there twice"),
+    ("budget: &a 2\nmemory: *a", "holds an alias"),
+    ("budget: !!int '2'", "holds a tag"),
+    ("budget: [", "expected the node content"),
+]
+
+
+@pytest.mark.parametrize(("said", "message"), TWO_MEANINGS)
+@pytest.mark.parametrize(
+    ("where", "override"),
+    [
+        ("conf/experiment/mine.yaml", "experiment=mine"),
+        ("mine.yaml", "experiment=mine.yaml"),
+        ("conf/effort/mine.yaml", "effort=mine"),
+    ],
+)
+def test_a_config_that_can_be_read_in_two_ways_is_refused_with_file_and_line(folder, where, override, said, message):
+    write(folder, where, f"# @package _global_\n\nlibrary:\n  {said.replace(chr(10), chr(10) + '  ')}\n")
+    with pytest.raises(ConfigError) as caught:
+        compose([override])
+    told = str(caught.value)
+    assert where in told and message in told and re.search("line [45]", told) and "\n" not in told
+
+
+def test_plain_files_of_a_project_are_read_as_ever(folder):
+    write(
+        folder, "conf/effort/mine.yaml", "# @package _global_\neffort: {name: mine, suffix: '-m'}\nlibrary: {size: 3}"
+    )
+    write(folder, "conf/propagator/nothing.yaml", "")
+    assert compose(["effort=mine"])["library"]["size"] == 3
+    assert "nothing" in options_of("propagator")
+
+
 def test_another_applications_config_folder_does_not_replace_ours(folder):
     write(folder, "conf/config.yaml", "defaults: [db: mysql]")
     assert compose([])["name"] == "unicycle_node"
@@ -73,7 +111,7 @@ def test_an_experiment_may_be_any_file(folder):
         ("plugins: a.py", "plugins must be a list of Python files or modules, found 'a.py'"),
         ("experiment: 3", "experiment must be a name, found 3"),
         ("[1]", "must be a mapping with the keys plugins, experiment"),
-        ("a: [", "cannot be read as YAML"),
+        ("a: [", "conf/project.yaml: not readable as YAML .line 1: expected the node content"),
         ("plugins: [nowhere.py]", "plugin nowhere.py: no such file"),
         ("experiment: nowhere", "nowhere"),
     ],

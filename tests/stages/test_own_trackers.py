@@ -20,6 +20,7 @@ from sagemp_cli.pipeline.models import tracker_from
 from sagemp_cli.pipeline.stage import stage_named
 from sagemp_cli.plugins import registry
 from sagemp_cli.storage import TrackerModel, read_artifact
+from sagemp_cli.storage.content import content_hash
 
 
 @pytest.fixture
@@ -76,6 +77,7 @@ def test_an_artifact_that_names_a_file_instead_of_holding_a_network_is_refused(w
     with h5py.File(path, "r+") as file:
         arguments = json.loads(file["data"].attrs["arguments"])
         file["data"].attrs["arguments"] = json.dumps({k: v for k, v in arguments.items() if k != "network"})
+        file.attrs["content_sha256"] = content_hash(file)
     artifact = read_artifact(path, TrackerModel)
     with pytest.raises(ArtifactError, match="made by train-tracker"):
         tracker_from(artifact)

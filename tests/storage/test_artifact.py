@@ -20,6 +20,7 @@ from sagemp_cli.storage import (
     Parent,
     Rollouts,
     open_header,
+    read_any_artifact,
     read_artifact,
     sha256_of,
     write_artifact,
@@ -126,6 +127,15 @@ def test_an_artifact_of_another_kind_is_refused(example, tmp_path):
     path = write_artifact(tmp_path / "a.h5", example(Demonstrations), HEADER)
     with pytest.raises(ArtifactError, match="is an artifact of kind 'demonstrations', 'rollouts' is needed here"):
         read_artifact(path, Rollouts)
+
+
+def test_a_file_that_was_changed_is_read_by_nobody_but_who_looks_at_it(example, tmp_path):
+    path = write_artifact(tmp_path / "a.h5", example(Rollouts), HEADER)
+    with h5py.File(path, "r+") as file:
+        file["data/states"][...] = 0.0
+    with pytest.raises(ArtifactError, match=r"a.h5: the content was changed after it was written .* with --overwrite"):
+        read_artifact(path, Rollouts)
+    assert not read_any_artifact(path)[1].unchanged
 
 
 def test_a_newer_format_is_refused(example, tmp_path):
