@@ -35,6 +35,8 @@ from learned import learned_unicycle  # noqa: E402
 from swarm import Swarm  # noqa: E402
 
 from sagemp_cli.loop.closed_loop import ClosedLoop  # noqa: E402
+from sagemp_cli.problem import Problem  # noqa: E402
+from sagemp_cli.reachability import reach  # noqa: E402
 from sagemp_cli.reachability.affine.affine import Affine  # noqa: E402
 from sagemp_cli.reachability.crown.best import Best  # noqa: E402
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa  # noqa: E402
@@ -42,6 +44,7 @@ from sagemp_cli.reachability.program.loops import RecordedLoop, recorded  # noqa
 from sagemp_cli.reachability.propagator import Loop, Propagator  # noqa: E402
 from sagemp_cli.sets import Box, Tube  # noqa: E402
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions  # noqa: E402
+from sagemp_cli.verification.cells import CellProver, Chunk  # noqa: E402
 
 FOLDER = Path("artifacts") / "benchmarks"
 MEMORY = 2.0
@@ -158,6 +161,33 @@ def unicycle_tightness(quick: bool) -> list[Figure]:
             Figure(f"{name}: width over the inner estimate", width, "x", asked),
             Figure(f"{name}: time", seconds, "s"),
         ]
+    return figures
+
+
+@row("a chunk of one cell, as a verification proves it")
+def one_cell(quick: bool) -> list[Figure]:
+    figures = []
+    for name in ("unicycle", "planar_quadrotor", "quadrotor"):
+        case = cases.load(name, FOLDER)
+        problem = Problem(case.dynamics, case.scene, case.start, case.disturbance, case.loop().horizon)
+        cell = Box(case.start.lower[None], case.start.upper[None])
+        chunk = Chunk(0, torch.zeros(1, dtype=torch.int64), case.references[:1], cell)
+        prover = CellProver(Affine(), problem, case.tracker)
+        seconds, _ = timed(lambda p=prover, c=chunk: p.prove(c), 5)
+        figures.append(Figure(f"affine, {name}: time", seconds, "s", note="the step is recorded at the first chunk"))
+    return figures
+
+
+@row("loops of one's own")
+def own_loops(quick: bool) -> list[Figure]:
+    case = cases.load("unicycle", FOLDER)
+    loop, start, w = case.loop(), case.start, case.disturbance
+    steps = {"steps alike": lambda k, x, w: loop.step(0, x, w), "steps with references": loop.step}
+    function, _ = timed(lambda: reach(lambda x, w: loop.step(0, x, w), start, w, loop.horizon))
+    figures = [Figure("reach of a function: time", function, "s")]
+    for what, step in steps.items():
+        seconds, _ = timed(lambda s=step: reach(s, start, w, loop.horizon))
+        figures.append(Figure(f"step(k, x, w), {what}: time over the function's", seconds / function, "x", 2.0))
     return figures
 
 

@@ -57,7 +57,7 @@ class Example:
         self._kind = kind
         self._blocks: dict[int, _Block] = {}
         self._constants: dict[int, Tensor] = {}
-        self._largest = 1.0
+        self._largest: float | None = None  # number among the operands
         self._recorder: Any = None
         self.result: Any = None
 
@@ -90,8 +90,6 @@ class Example:
             flat = ids.as_strided((storage.nbytes() // ids.element_size(),), (1,), 0)
             numbers = self._recorder.example(flat)
             self._blocks[storage._cdata] = block = _Block(flat, numbers)
-            if numbers.numel():
-                self._largest = max(self._largest, float(torch.nan_to_num(numbers).abs().amax()))
         return block.numbers.as_strided(ids.size(), ids.stride(), ids.storage_offset())
 
     def settle(self, answer: Any, name: str) -> Any:
@@ -131,6 +129,7 @@ class Example:
             if block.numbers.untyped_storage()._cdata == where:
                 view = block.ids.as_strided(result.size(), result.stride(), result.storage_offset())
                 if block.written:
+                    self._find_largest()
                     # Not copy_: torch may fill memory that several entries share, with the same for all of them.
                     block.ids[_places(block.ids, view)] = ids
                     if not torch.equal(view, ids):
@@ -148,9 +147,18 @@ class Example:
     def _is_constant(self, result: Any) -> bool:
         return isinstance(result, Tensor) and result.untyped_storage()._cdata in self._constants
 
+    def _find_largest(self) -> float:
+        """1, or the largest size of a number among the operands before torch wrote into them."""
+        if self._largest is None:
+            before = (self._recorder.example(block.ids) for block in self._blocks.values() if block.ids.numel())
+            self._largest = max([1.0, *(float(torch.nan_to_num(numbers).abs().amax()) for numbers in before)])
+        return self._largest
+
     def _same(self, ids: Tensor, numbers: Tensor) -> bool:
         recorded = self._recorder.example(ids)
-        off = (recorded - numbers).abs() > _CLOSE * (self._largest + numbers.abs())
+        if torch.equal(recorded, numbers):  # the most frequent case by far, and quickly told
+            return True
+        off = (recorded - numbers).abs() > _CLOSE * (self._find_largest() + numbers.abs())
         return not bool((off & (ids >= 0)).any())
 
 

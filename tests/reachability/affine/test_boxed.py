@@ -86,3 +86,13 @@ def test_notes_of_cells_survive_being_sent_and_joined():
 
     joined = CellTubes.join([CellTubes.of(found("one").arrays()), found("two", "one"), CellTubes.of(found().arrays())])
     assert joined.notes == ("one", "two") and joined.select(torch.tensor([2])).notes == joined.notes
+
+
+def test_of_a_large_batch_some_cells_are_followed_with_their_own_masks():
+    generator = np.random.default_rng(0)
+    one, kept = generator.normal(size=(1, 2, 6)), np.array([[True, False, True, True, False, True]])
+    alone, many = Boxed(4), Boxed(4)
+    for boxed, times in ((alone, 1), (many, 40)):
+        for _ in range(2):
+            boxed.follow(one.repeat(times, 0), kept.repeat(times, 0))
+    assert many.share == pytest.approx(alone.share, rel=1e-12) and alone.share > 0.1
