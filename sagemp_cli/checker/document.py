@@ -126,9 +126,10 @@ def _read(file: Group, path: Path) -> Document:
             f"{path}: format {version} of '{schema}' is newer than this checker knows (up to {KINDS[schema]})"
         )
     if version < KINDS[schema]:
+        command = "prove" if file.attrs.get("stage") == "prove" else _COMMANDS[schema]
         raise ArtifactError(
             f"{path}: format {version} of '{schema}' is an old one, which does not say what holds between the samples; "
-            f"make it again with 'sagemp {_COMMANDS[schema]} --overwrite'"
+            f"make it again with 'sagemp {command} --overwrite'"
         )
     stored = str(file.attrs.get("content_sha256", ""))
     if not stored:

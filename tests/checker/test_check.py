@@ -195,6 +195,11 @@ def test_a_hash_does_not_depend_on_how_the_file_is_stored(certificate, mutate, t
     ("change", "message"),
     [
         (lambda f: f.attrs.__setitem__("schema_version", 9), "format 9 of 'sagemp/certificate' is newer than this"),
+        (
+            lambda f: f.attrs.__setitem__("schema_version", 2),
+            "which does not say what holds between the samples; make it",
+        ),
+        (lambda f: f.attrs.update(schema_version=1, stage="prove"), "make it again with 'sagemp prove --overwrite'"),
         (lambda f: f.attrs.__setitem__("schema", "sagemp/tracker"), "only sagemp/certificate and sagemp/library can"),
         (lambda f: f.attrs.__delitem__("content_sha256"), "has no content hash"),
         (lambda f: f["data/tubes"].__setitem__("copy", h5py.SoftLink("/data")), "/data/tubes/copy is a link"),
