@@ -7,6 +7,7 @@ project. Outcomes are lines of a log, so that a run that was stopped goes on.
 
     python benchmarks/mutation.py --sample 300            # 300 mutants, chosen by --seed
     python benchmarks/mutation.py --only checker --sample 50
+    python benchmarks/mutation.py --again --only angle --tests tests/checker/test_step.py   # survivors, against these
     python benchmarks/mutation.py --report                # what the log says: rate, survivors
 """
 
@@ -29,7 +30,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -119,13 +120,15 @@ class Recorder:
 
 
 class Chosen:
-    """A plugin of pytest that runs the named tests in their order, and notes the first that fails."""
+    """A plugin of pytest that runs the named tests in their order (or all, if none is named) until the first fails."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.order = {name: i for i, name in enumerate(names)}
         self.failed = ""
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        if not self.order:
+            return
         items[:] = sorted((i for i in items if i.nodeid in self.order), key=lambda i: self.order[i.nodeid])
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -140,10 +143,11 @@ class Bench:
         folder: where the copy goes.
         costs: log of what the tests cost.
         budget: of the tests that call a function the cheapest run, up to so many seconds of processor time.
+        given: files of tests that run instead, all of them, whatever they call.
     """
 
-    def __init__(self, folder: Path, costs: Path, budget: float) -> None:
-        self.folder, self.budget = folder, budget
+    def __init__(self, folder: Path, costs: Path, budget: float, given: Sequence[str] = ()) -> None:
+        self.folder, self.budget, self.given = folder, budget, given
         for name in COPIED:
             source = ROOT / name
             if source.is_dir():
@@ -155,7 +159,7 @@ class Bench:
             importlib.import_module(name)
         phases = set(hypothesis.Phase) - {hypothesis.Phase.shrink, hypothesis.Phase.explain}
         hypothesis.settings.register_profile("mutants", phases=phases)
-        self.costs = self._measured(costs)
+        self.costs = {} if given else self._measured(costs)
 
     def _measured(self, path: Path) -> dict[str, Cost]:
         """The cost of every test, measured file by file where the log of costs does not have it yet."""
@@ -212,7 +216,7 @@ class Bench:
 
     def outcome(self, mutant: Mutant) -> dict[str, object]:
         """Whether the tests notice a mutant, and how long that took."""
-        tests, path = self.tests_of(mutant), self.folder / mutant.file
+        tests, path = list(self.given) or self.tests_of(mutant), self.folder / mutant.file
         if not tests:
             return {"result": "survived", "by": "no test calls it", "tests": 0, "seconds": 0.0}
         source = path.read_text(encoding="utf-8")
@@ -222,12 +226,12 @@ class Bench:
         began = time.monotonic()
 
         def work() -> dict:
-            plugin = Chosen(tests)
+            plugin = Chosen(tests if not self.given else ())
             files = dict.fromkeys(name.split("::")[0] for name in tests)
             code = int(pytest.main(["-x", *OPTIONS, *files], plugins=[plugin]))
             return {"code": code, "failed": plugin.failed}
 
-        usual = sum(self.costs[name].seconds for name in tests)
+        usual = sum(self.costs[name].seconds for name in tests) if not self.given else 60.0
         try:
             told = self._forked(work, limit=TOLERANCE * usual + 30.0)
         finally:
@@ -378,6 +382,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the names of the files, e.g. checker")
     parser.add_argument("--log", type=Path, default=Path("mutation.jsonl"), help="lines of JSON, one a mutant")
     parser.add_argument("--again", action="store_true", help="run the survivors in the log once more, and only them")
+    parser.add_argument("--tests", nargs="+", default=[], help="run these files of tests, not those that call")
     parser.add_argument("--budget", type=float, default=40.0, help="seconds of tests a mutant, as measured once")
     parser.add_argument("--list", action="store_true", help="list the chosen mutants, run nothing")
     parser.add_argument("--report", action="store_true", help="say what the log says, run nothing")
@@ -398,7 +403,7 @@ def main() -> None:
         chosen = [m for m in all_mutants(options.only) if m.key in alive]
         known = {}
     with tempfile.TemporaryDirectory(prefix="sagemp-mutation-") as folder:
-        bench = Bench(Path(folder).resolve(), options.log.with_suffix(".costs.jsonl"), options.budget)
+        bench = Bench(Path(folder).resolve(), options.log.with_suffix(".costs.jsonl"), options.budget, options.tests)
         for number, mutant in enumerate(chosen, start=1):
             if mutant.key in known:
                 continue

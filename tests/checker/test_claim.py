@@ -1,5 +1,6 @@
 """What is printed of a certificate: the claim in full, equations that are the program, and what is only said."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -125,3 +126,9 @@ def test_a_counterexample_that_fails_is_named(make, mutate, tmp_path):
     report = check(falsified(make(), tmp_path / "clear.h5"))
     assert report.counterexamples == ((0, "its replay violates nothing for certain at step 8"),)
     assert any("counterexample to reference 0: NOT PROVED: its replay violates" in text for text in as_lines(report))
+
+
+def test_a_control_that_is_the_state_itself_is_a_control_too(certificate):
+    own = program(line("add", 0, 1), n=4, d=4, next=2, control=0)
+    found = claim_rows(dataclasses.replace(read_document(certificate), programs=(own,)))
+    assert "control" in [label for label, _ in found]

@@ -169,6 +169,9 @@ def test_an_angle_whose_point_meets_the_jump_is_only_known_to_be_an_angle(direct
                    line("join", 4, 4), next=5)  # fmt: skip
     with pytest.raises(Unproved, match="a recorded relaxation of 'atan2' is wrong"):
         bounds(made, record_of(made, Entry(0.0, 0.0, 3.14), direction))
+    for side in (-3.0, 3.0):  # not even if the direction is on one side of the jump
+        with pytest.raises(Unproved, match="a recorded relaxation of 'atan2' is wrong"):
+            bounds(made, record_of(made, Entry(0.0, side, 6.0), direction))
     found = bounds(made, record_of(made, Entry(0.0, 0.0, 3.15), direction))
     np.testing.assert_allclose(found, [[-np.pi, np.pi]] * 2)
 

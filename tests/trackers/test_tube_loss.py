@@ -114,6 +114,21 @@ def test_an_exploding_tube_has_a_finite_loss_and_gradient(unicycle, references, 
     assert any(bool((p.grad != 0).any()) for p in tracker.parameters()), "the steps before it exploded still teach"
 
 
+@pytest.mark.parametrize("gain", [1e3, 1e4])
+def test_a_tube_counts_as_it_is_until_it_explodes_and_as_the_widest_from_there(
+    gain, unicycle, references, start, disturbance, make_tracker
+):
+    tracker = make_tracker(control_scale=[gain, gain])
+    loss = TubeLoss(weight=1.0, references=1, counts=[1, 1], steps=12, symbols=10_000, scale=0.1, end=0.5)
+    value, _ = loss_of(loss, tracker, unicycle, references[:1], start, disturbance)
+    width = Affine().propagate(ClosedLoop(unicycle, tracker, references[0]), start, disturbance).width[1:].detach()
+    exploded = (~(width <= 1e6)).any(-1).cumsum(0) > 0
+    assert 0 < int(exploded.sum()) < 12
+    width[exploded] = 1e6
+    cost = torch.log1p(width / 0.1)
+    assert value.item() == pytest.approx((cost.mean() + 0.5 * cost[-1].mean()).item(), rel=1e-5)
+
+
 def test_a_wrong_share_is_refused():
     with pytest.raises(ConfigError, match=re.escape("tracker_training.tube.shrink must lie in (0, 1], found 0")):
         TubeLoss(shrink=0)

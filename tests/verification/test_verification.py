@@ -14,7 +14,7 @@ from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verdict import Outcome
-from sagemp_cli.verification.verification import verify_references
+from sagemp_cli.verification.verification import require_references, verify_references
 
 K = 6
 SCENE = Scene(Box([-2.0, -2.0], [4.0, 2.0]), (Ball((1.0, 1.5), 0.2, "disc"),), Box([-9.0] * 4, [9.0] * 4))
@@ -117,3 +117,9 @@ def test_a_reference_that_is_not_finite_is_named_with_step_and_state(unicycle, t
 def test_references_of_another_robot_are_refused(unicycle, tracker):
     with pytest.raises(UsageError, match=r"references must have shape \(count, K\+1, 4\), found \(2, 7, 3\)"):
         prove(Affine(), unicycle, tracker, references(2)[..., :3])
+
+
+def test_references_have_two_points_at_least(unicycle):
+    require_references(references(1)[:, :2], unicycle)
+    with pytest.raises(UsageError, match=r"references must have shape \(count, K\+1, 4\), found \(1, 1, 4\)"):
+        require_references(references(1)[:, :1], unicycle)

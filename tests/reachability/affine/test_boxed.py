@@ -61,6 +61,10 @@ def test_the_excess_of_a_box_is_followed_where_it_goes():
     # Now the box is the last two, all of the first and nothing of the second is excess; the loop turned them.
     boxed.follow(np.array([[[1.0, 1.0, 0.0, 4.0], [0.0, 1.0, 6.0, 0.0]]]), None)
     assert boxed.share == pytest.approx(6 / 7)
+    assert boxed.notes() == (
+        "symbols=2: up to 85.7 % of the tube's width are there because generators were boxed; "
+        "with more symbols it may be up to 7 times narrower",
+    )
     assert Boxed(symbols=None).notes() == ()
 
 
