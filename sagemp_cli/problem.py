@@ -19,8 +19,8 @@ class Problem:
         start: X_I, ``(n,)``; ``(R, n)`` where each of R references has its own.
         disturbance: W, ``(d,)``.
         horizon: number of steps K.
-        between: whether the safe set is to be kept over the whole of every step. It is for every robot here; a
-            stranger's loop may be no motion along straight lines.
+        between: whether the safe set is to be kept over the whole of every step: along straight lines in discrete time,
+            at all times in continuous time. It is for every robot here; a stranger's loop may be no such motion.
     """
 
     dynamics: Dynamics

@@ -20,6 +20,9 @@ from sagemp_cli.errors import ConfigError
 
 DISTURBANCE_READINGS = ("derivative", "state")
 
+SIMULATED = 4
+"""Parts of a period in which a robot in continuous time is simulated (classical Runge-Kutta method)."""
+
 
 class Dynamics(nn.Module):
     """Base of all robot models, ``x_{k+1} = f(x_k, u_k, w_k)`` (paper, equation 1).
@@ -29,6 +32,10 @@ class Dynamics(nn.Module):
     The paper leaves open how w enters. ``disturbance="derivative"`` (default) reads
     ``x_{k+1} = x_k + dt (f(x_k, u_k) + w_k)``; ``disturbance="state"`` reads
     ``x_{k+1} = x_k + dt f(x_k, u_k) + w_k``.
+
+    With ``time="continuous"`` the robot is the ODE ``x' = f(x, u) + w`` itself, u is held between the instants
+    ``k dt``, and a step is a simulated solution over one period with w held too. What is proved speaks of all times and
+    of every measurable w (``docs/continuous_time.md``).
     """
 
     state_names: tuple[str, ...]
@@ -55,6 +62,7 @@ class Dynamics(nn.Module):
         state_lower: list[float],
         state_upper: list[float],
         disturbance: Literal["derivative", "state"] = "derivative",
+        time: Literal["discrete", "continuous"] = "discrete",
     ) -> None:
         super().__init__()
         name = type(self).__name__
@@ -62,7 +70,14 @@ class Dynamics(nn.Module):
             raise ConfigError(f"{name}: dt must be a positive number of seconds, found {dt}")
         if disturbance not in DISTURBANCE_READINGS:
             raise ConfigError(f"{name}: disturbance must be one of {DISTURBANCE_READINGS}, found '{disturbance}'")
+        if time not in ("discrete", "continuous"):
+            raise ConfigError(f"{name}: time must be 'discrete' or 'continuous', found '{time}'")
+        if time == "continuous" and disturbance != "derivative":
+            raise ConfigError(
+                f"{name}: with time=continuous w is added to the derivative, found disturbance '{disturbance}'"
+            )
         self.dt = float(dt)
+        self.time: Literal["discrete", "continuous"] = time
         self.disturbance: Literal["derivative", "state"] = disturbance
         for key, values, size in (
             ("control_lower", control_lower, self.control_dim),
@@ -106,9 +121,44 @@ class Dynamics(nn.Module):
         """The undisturbed state derivative ``f(x, u)``; ``x (..., n)``, ``u (..., m)`` to ``(..., n)``."""
         raise NotImplementedError
 
+    @property
+    def continuous(self) -> bool:
+        """Whether the robot is an ODE, not a map from instant to instant."""
+        return self.time == "continuous"
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """One forward-Euler step under the disturbance ``w (..., n)``; see the class for how w enters."""
+        """One forward-Euler step under the disturbance ``w (..., n)``; in continuous time a simulated solution over one
+        period. See the class for how w enters.
+        """
+        if self.continuous:
+            return self._simulated(x, u, w)[-1]
         return self.advance(x, self.derivative(x, u), w)
+
+    def path(self, states: Tensor, controls: Tensor, w: Tensor) -> Tensor:
+        """A simulated rollout ``(..., K+1, n)`` with points between the instants, ``(..., P+1, n)``.
+
+        In discrete time the rollout itself: between the instants are straight lines.
+
+        Args:
+            states, controls, w: of the rollout, ``(..., K+1, n)``, ``(..., K, m)`` and ``(..., K, n)``.
+        """
+        if not self.continuous:
+            return states
+        inner = self._simulated(states[..., :-1, :], controls, w)[:-1]
+        inside = torch.stack([states[..., :-1, :], *inner], dim=-2).flatten(-3, -2)
+        return torch.cat([inside, states[..., -1:, :]], dim=-2)
+
+    def _simulated(self, x: Tensor, u: Tensor, w: Tensor) -> list[Tensor]:
+        """States at the ends of the parts of a period."""
+        h, found = self.dt / SIMULATED, []
+        for _ in range(SIMULATED):
+            a = self.derivative(x, u) + w
+            b = self.derivative(x + h / 2 * a, u) + w
+            c = self.derivative(x + h / 2 * b, u) + w
+            d = self.derivative(x + h * c, u) + w
+            x = x + h / 6 * (a + 2 * b + 2 * c + d)
+            found.append(x)
+        return found
 
     def advance(self, x: Tensor, derivative: Tensor, w: Tensor) -> Tensor:
         """The same from a derivative that is known already."""

@@ -41,6 +41,7 @@ class Learned(Dynamics):
         inputs: names of the states that the network reads, all by default; it reads all controls. The columns of the
             first layer that belong to other states are zero: a robot that moves alike wherever it is need not be told
             where that is, and a wide set of positions then costs the proof nothing.
+        time: see :class:`~sagemp_cli.dynamics.base.Dynamics`; that of the model by default.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Learned(Dynamics):
         hidden: Widths,
         activation: Literal["leaky_relu", "silu", "softplus", "tanh"] = "silu",
         inputs: list[str] | None = None,
+        time: Literal["discrete", "continuous"] | None = None,
     ) -> None:
         robot = model
         if isinstance(robot, Learned):
@@ -72,6 +74,7 @@ class Learned(Dynamics):
             state_lower=robot.state_lower.tolist(),
             state_upper=robot.state_upper.tolist(),
             disturbance=robot.disturbance,
+            time=robot.time if time is None else time,
         )
         self.model = robot
         self.activation = activation

@@ -104,8 +104,9 @@ def execute_queries(
                 w = torch.cat([w, harm])
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)
+                path = problem.dynamics.path(states, controls, w)
             cells, tubes = library.cells_of(i)
-            clear = (problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]) > 0).all(-1)
+            clear = (problem.scene.signed_distance_along(path[..., list(problem.dynamics.position)]) > 0).all(-1)
             safe = clear & problem.scene.goal.contains(states[:, -1])
             parts.append((torch.full((rollouts,), q), states, controls, w, inside_tube(states, cells, tubes), safe))
             task.advance()

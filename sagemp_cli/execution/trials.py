@@ -110,9 +110,13 @@ def try_references(
                 loop = way(r)
                 harm = worst_case_disturbances(loop, x, disturbance=disturbance, generator=generator)
                 with torch.no_grad():
-                    rolled = [loop.rollout(x, w)[0] for w in (disturbance.center.expand_as(random), random, harm)]
-                states = torch.stack([part.unflatten(0, (len(some), rollouts)) for part in rolled], 1)
-                trials.append(_judged(states, problem))
+                    tried = [(w, loop.rollout(x, w)) for w in (disturbance.center.expand_as(random), random, harm)]
+                    paths = [dynamics.path(states, controls, w) for w, (states, controls) in tried]
+
+                def apart(parts: Sequence[Tensor], count: int = len(some)) -> Tensor:
+                    return torch.stack([part.unflatten(0, (count, rollouts)) for part in parts], 1)
+
+                trials.append(_judged(apart([states for _, (states, _) in tried]), apart(paths), problem))
             task.advance(len(some))
     open_loop, closed_loop = (
         Trials(*(torch.cat([getattr(t, name) for t in trials]) for name in ("clearance", "reached", "nearest")))
@@ -139,9 +143,9 @@ def require_certified_safe(certified: Sequence[int], trials: Trials) -> None:
             )
 
 
-def _judged(states: Tensor, problem: Problem) -> Trials:
-    """Of rollouts ``(R, D, M, K+1, n)``."""
-    distance = problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]).amin(-1)
+def _judged(states: Tensor, paths: Tensor, problem: Problem) -> Trials:
+    """Of rollouts ``(R, D, M, K+1, n)`` and their paths between the samples, ``(R, D, M, P+1, n)``."""
+    distance = problem.scene.signed_distance_along(paths[..., list(problem.dynamics.position)]).amin(-1)
     finite = torch.isfinite(states).flatten(-2).all(-1)
     clearance = torch.where(finite, distance, -torch.inf)
     worst = clearance.argmin(-1)[..., None, None, None].expand(-1, -1, 1, *states.shape[-2:])

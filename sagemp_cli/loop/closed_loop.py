@@ -55,6 +55,20 @@ class ClosedLoop:
         """Number of states n."""
         return self.dynamics.state_dim
 
+    @property
+    def period(self) -> float:
+        """Seconds between two instants."""
+        return self.dynamics.dt
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the robot is an ODE whose control is held between the instants."""
+        return self.dynamics.continuous
+
+    def rate(self, x: Tensor, u: Tensor) -> Tensor:
+        """The undisturbed derivative of the state, ``f(x, u)``."""
+        return self.dynamics.derivative(x, u)
+
     def window(self, k: int) -> Tensor:
         """The lookahead ``p_{k+1}..p_{k+N}``, padded with ``p_K``, shape ``(..., N, n)``."""
         index = torch.arange(k + 1, k + 1 + self.tracker.lookahead).clamp(max=self.horizon)

@@ -13,7 +13,7 @@ from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.models import robot_from
 from sagemp_cli.problem import Problem
 from sagemp_cli.scenes.scene import scene_from_mapping
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box
 from sagemp_cli.storage import Artifact, DynamicsModel
 
 
@@ -56,6 +56,7 @@ def problem_of(config: Mapping[str, Any]) -> Problem:
         start=Box.around(center, radius),
         disturbance=Box.around([0.0] * n, disturbance),
         horizon=horizon,
+        between=Between.CONTINUOUS if dynamics.continuous else Between.SEGMENTS,
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, doc
+from annotated_types import Gt, Interval, Predicate, doc
 from torch import Tensor
 
 from sagemp_cli.config.binding import Binding, build
@@ -16,12 +16,17 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress
+from sagemp_cli.reachability.flow import AskedDivision
 from sagemp_cli.reachability.propagator import Propagator
 from sagemp_cli.sets.partition import parse_partitions, uncertain_dimensions
 from sagemp_cli.verification.cells import CellProver, Pieces
 from sagemp_cli.verification.executors import Executor
 from sagemp_cli.verification.memory import cells_within, footprint
 from sagemp_cli.verification.verification import Verification, require_references, verify_references
+
+
+def _power_of_two(count: int) -> bool:
+    return count > 0 and count & (count - 1) == 0
 
 
 @dataclass(frozen=True)
@@ -32,11 +37,19 @@ class ProofOptions:
         partitions: as :func:`~sagemp_cli.sets.partition.parse_partitions` reads it.
         budget: cells of one reference at most, with ``partitions: auto``.
         memory: of the results and of what is propagated at a time.
+        substeps, order: in continuous time, how periods are divided and how far flows are expanded.
     """
 
     partitions: Any
     budget: Count
     memory: Annotated[float, Gt(0), doc("a positive number of GiB")]
+    substeps: Annotated[int, Predicate(_power_of_two), doc("a power of two")] | Literal["auto"] = "auto"
+    order: Annotated[int, Interval(ge=1, le=8), doc("a whole number from 1 to 8")] | Literal["auto"] = "auto"
+
+    @property
+    def division(self) -> AskedDivision:
+        """The last two."""
+        return AskedDivision(*(None if value == "auto" else value for value in (self.substeps, self.order)))
 
 
 SECTION = Binding("proof", ProofOptions)
@@ -54,6 +67,7 @@ class Proof:
         budget: cells of one reference at most, in an adaptive partition.
         memory: GiB.
         compared: whether it is about the analytical model of a learned robot.
+        division: in continuous time, how periods are to be divided.
     """
 
     problem: Problem
@@ -63,6 +77,7 @@ class Proof:
     budget: int
     memory: float
     compared: bool = False
+    division: AskedDivision = AskedDivision()
 
     @classmethod
     def of(cls, config: Mapping[str, Any], problem: Problem) -> Proof:
@@ -79,6 +94,7 @@ class Proof:
             counts=counts_of(options.partitions, problem, "proof"),
             budget=options.budget,
             memory=options.memory,
+            division=options.division,
         )
 
     def verify(
@@ -94,7 +110,7 @@ class Proof:
         require_references(references, problem.dynamics)
         if steps != problem.horizon:
             raise ConfigError(f"horizon is {problem.horizon}, but the planner's references have {steps} steps")
-        prover = CellProver(self.propagator, problem, tracker, self.compared)
+        prover = CellProver(self.propagator, problem, tracker, self.compared, self.division)
         found = footprint(prover, references[0])
         return verify_references(
             prover,

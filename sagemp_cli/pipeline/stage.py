@@ -90,7 +90,7 @@ class Stage:
         self, found: Mapping[str, Any], wanted: Mapping[str, Any], *, without: Sequence[str] = ()
     ) -> tuple[str, Any, Any] | None:
         """The first dotted key that its output depends on and that differs in two configs, with both values."""
-        before, now = (self.settings(config, without=without) for config in (found, wanted))
+        before, now = (self.settings(config, without=without) for config in (_with_later_keys(found), wanted))
         return next((_difference(key, before[key], now[key]) for key in now if before[key] != now[key]), None)
 
     @property
@@ -279,6 +279,32 @@ def stages_of(config: Mapping[str, Any], last: Sequence[str] | None = None) -> l
             if config["sources"].get(name) is None:
                 waiting += stage_named(name).inputs_in(config)
     return [stage for stage in every if stage.name in needed]
+
+
+_LATER: Mapping[str, Any] = {
+    "dynamics.time": "discrete",
+    "dynamics.model.time": "discrete",
+    "proof.substeps": "auto",
+    "proof.order": "auto",
+}
+"""Keys that came after files had been written without them, and what these files were made with."""
+
+
+def _with_later_keys(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The config of a file, with what it does not say because nothing else was possible."""
+    found = dict(config)
+    for dotted, value in _LATER.items():
+        *sections, key = dotted.split(".")
+        node, inner = config, found
+        for part in sections:
+            node = node.get(part)
+            if not isinstance(node, Mapping):
+                break
+            inner[part] = dict(inner[part])
+            inner = inner[part]
+        else:
+            inner.setdefault(key, value)
+    return found
 
 
 def _value(config: Mapping[str, Any], dotted: str, *, without: Sequence[str]) -> Any:

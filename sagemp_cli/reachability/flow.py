@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from torch import Tensor
+
+from sagemp_cli.errors import UsageError
+from sagemp_cli.sets import Box, Bulge, Tube, round_up
 
 
 @dataclass(frozen=True)
@@ -21,6 +26,19 @@ class Division:
 
     substeps: int
     order: int
+
+
+@dataclass(frozen=True)
+class AskedDivision:
+    """How a period is to be cut and how far the flow is to be expanded.
+
+    Attributes:
+        substeps: equal parts, a power of two; None: as many as are needed.
+        order: degree of the Taylor polynomials; None: what serves most loops.
+    """
+
+    substeps: Annotated[int, Ge(1)] | None = None
+    order: Annotated[int, Ge(1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -57,15 +75,61 @@ class Flow:
         sides = zip(signs, self._sides(), strict=True)
         return Flow(self.division, *(torch.where(lost, sign * torch.inf, side) for sign, side in sides))
 
+    def lines(self, tube: Tube, w: Box, period: float) -> tuple[Tube, Bulge]:
+        """Boxes at the ends of all parts, ``(C, K S + 1, n)``, and how far solutions leave the straight lines between.
+
+        Args:
+            tube: at the instants, ``(C, K+1, n)``.
+            w: W, ``(n,)`` or for each period ``(K, n)``.
+            period: seconds.
+        """
+        ends = [
+            torch.cat([side.flatten(1, 2), of_tube[:, -1:]], 1)
+            for side, of_tube in zip((self.state_lower, self.state_upper), (tube.lower, tube.upper), strict=True)
+        ]
+        parts = self.division.substeps
+        swing = round_up(2 * period / parts * w.radius).expand(self.lower.shape[1], -1)
+        rest = round_up(2 * self.drift.flatten(1, 2))
+        return Tube(*ends), Bulge(self.curve.flatten(1, 2), swing.repeat_interleave(parts, 0), rest)
+
+    def arrays(self) -> dict[str, Tensor]:
+        """All of it by name."""
+        division = torch.tensor([self.division.substeps, self.division.order])
+        names = [field.name for field in dataclasses.fields(self)[1:]]
+        return {"division": division} | dict(zip(names, self._sides(), strict=True))
+
+    @staticmethod
+    def of(arrays: Mapping[str, Tensor]) -> Flow:
+        """Back from :meth:`arrays`.
+
+        Raises:
+            KeyError: an array is missing.
+        """
+        substeps, order = arrays["division"].tolist()
+        return Flow(Division(substeps, order), *(arrays[field.name] for field in dataclasses.fields(Flow)[1:]))
+
     def padded(self, periods: int) -> Flow:
         """The same with so many periods more, of which nothing is said yet."""
         return Flow(self.division, *(torch.nn.functional.pad(s, (0, 0, 0, 0, 0, periods)) for s in self._sides()))
 
     @staticmethod
-    def join(parts: Sequence[Flow], dim: int = 0) -> Flow:
-        """One after the other, of cells (0) or of periods (1)."""
-        sides = zip(*(part._sides() for part in parts), strict=True)
-        return Flow(parts[0].division, *(torch.cat(side, dim) for side in sides))
+    def join(parts: Sequence[Flow | None], dim: int = 0) -> Flow | None:
+        """One after the other, of cells (0) or of periods (1); None if one of them is.
+
+        Raises:
+            UsageError: they are not divided alike.
+        """
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts):
+            return None
+        counts = sorted({part.division.substeps for part in known})
+        if len(counts) > 1:
+            raise UsageError(
+                f"references need their periods cut into {' and '.join(map(str, counts))} parts; one number has to "
+                f"serve all: proof.substeps={counts[-1]}"
+            )
+        sides = zip(*(part._sides() for part in known), strict=True)
+        return Flow(known[0].division, *(torch.cat(side, dim) for side in sides))
 
     def _sides(self) -> list[Tensor]:
         return [getattr(self, field.name) for field in dataclasses.fields(self)[1:]]

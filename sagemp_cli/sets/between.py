@@ -34,13 +34,19 @@ class Between(StrEnum):
 
     SEGMENTS = "segments"
     """The safe set is kept over the whole of every step, along straight lines from sample to sample."""
+    CONTINUOUS = "continuous"
+    """The safe set is kept at all times, by every solution of an ODE."""
     SAMPLES = "samples"
     """Nothing: the safe set is kept at the samples only."""
 
     @property
     def words(self) -> str:
         """When the safe set is kept, for verdicts and figures."""
-        return "at the samples only" if self is Between.SAMPLES else "over the whole of every step"
+        return {
+            Between.SAMPLES: "at the samples only",
+            Between.SEGMENTS: "over the whole of every step",
+            Between.CONTINUOUS: "at all times",
+        }[self]
 
 
 @dataclass(frozen=True)

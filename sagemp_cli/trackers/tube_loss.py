@@ -2,7 +2,8 @@
 
 The tube comes from the same forward affine arithmetic that verifies, on a few references and cells per step, with
 few generators, and the radius of the sets annealed from small to full: a full-size tube of an untrained tracker
-explodes and its gradient says nothing.
+explodes and its gradient says nothing. In continuous time it is the tube of the Taylor polynomials without their
+remainders, which are small: a loss proves nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.reach import polynomial_steps
 from sagemp_cli.sets import Box
 
 WIDEST = 1e6
@@ -74,12 +76,13 @@ class TubeLoss:
         box = Box(around + cells.lower, around + cells.upper)
         w = Box(problem.disturbance.lower * size, problem.disturbance.upper * size)
         steps = min(self.steps, loop.horizon)
-        width = Affine(symbols=self.symbols).run(loop, box, w, horizon=steps).tube.width[:, 1:]
+        bounded, w = (polynomial_steps(loop, box, w)) if loop.continuous else (loop, w)
+        width = Affine(symbols=self.symbols).run(bounded, box, w, horizon=steps).tube.width[:, 1:]
         fits = (width.detach() <= WIDEST).all(-1).all(0)
         if not bool(fits.all()):
             # The gradient of a tube that overflows is NaN, also at the steps before: only those are run again.
             last = max(1, int((~fits).nonzero()[0]))
-            width = Affine(symbols=self.symbols).run(loop, box, w, horizon=last).tube.width[:, 1:]
+            width = Affine(symbols=self.symbols).run(bounded, box, w, horizon=last).tube.width[:, 1:]
             width = torch.cat([width, width.new_full((width.shape[0], steps - last, width.shape[-1]), WIDEST)], dim=1)
         scale = torch.as_tensor(self.scale, dtype=torch.float64)
         cost = torch.log1p(width.clamp(max=WIDEST) / scale)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Box
 from sagemp_cli.verification.cells import CellTubes
 
 PATIENCE = 3
@@ -32,7 +32,7 @@ def adaptive_cells(
     start: Box,
     *,
     budget: int,
-    shortfall: Callable[[Tube], tuple[Tensor, Tensor]],
+    shortfall: Callable[[CellTubes], tuple[Tensor, Tensor]],
     hopeless: Callable[[Tensor, Box], Tensor],
 ) -> CellTubes:
     """Cells that cover each start box, at most ``budget`` for each, split where it pays.
@@ -43,7 +43,7 @@ def adaptive_cells(
         prove: ``prove(cell_reference (B,), cells (B, n))``, the tubes of cells.
         start: X_I of each reference, ``(R, n)``.
         budget: cells of one reference at most, the trials that were given up not counted.
-        shortfall: of tubes, whether each is SAFE and how much is missing; see
+        shortfall: of cells, whether each is SAFE and how much is missing; see
             :func:`~sagemp_cli.verification.verdict.shortfall`.
         hopeless: ``hopeless(cell_reference (B,), cells (B, n))`` says of which cells a rollout is known that breaks the
             claim; a reference with such a cell is split no further.
@@ -57,7 +57,7 @@ def adaptive_cells(
     fresh = torch.ones(count, dtype=torch.bool)  # cells that were not yet tried for a violating rollout
     vain = torch.zeros(count, dtype=torch.int64)  # splits in a row that did not help, per cell
     while True:
-        safe, missing = shortfall(found.tube)
+        safe, missing = shortfall(found)
         doubtful = torch.nonzero(fresh & ~safe).flatten()
         owners = found.cell_reference[doubtful]
         if len(doubtful):
@@ -111,10 +111,10 @@ def _halves(cells: Box) -> tuple[Tensor, Box]:
 
 
 def _best(
-    parents: Tensor, trial: CellTubes, shortfall: Callable[[Tube], tuple[Tensor, Tensor]]
+    parents: Tensor, trial: CellTubes, shortfall: Callable[[CellTubes], tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
     """The trial of each parent whose halves miss least together, by narrower tubes if tied, and what those miss."""
-    missing = shortfall(trial.tube)[1].unflatten(0, (-1, 2)).sum(1)
+    missing = shortfall(trial)[1].unflatten(0, (-1, 2)).sum(1)
     width = torch.nan_to_num(trial.tube.width, nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
     spread = width.log().flatten(1).mean(1).unflatten(0, (-1, 2)).sum(1)
     best = []

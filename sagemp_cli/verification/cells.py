@@ -7,6 +7,7 @@ bits, on which cells are together in a chunk.)
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -17,12 +18,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
+from sagemp_cli.reachability.continuous.reach import reach_continuously
+from sagemp_cli.reachability.continuous.sampled import SampledLoop, sampled
+from sagemp_cli.reachability.flow import AskedDivision, Flow
 from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
 from sagemp_cli.reachability.program.program import Program
-from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.deviation import ComparedLoop
@@ -38,12 +43,14 @@ class Chunk:
         cell_reference: which reference each cell belongs to, ``(B,)``.
         references: that reference, ``(B, K+1, n)``.
         cells: ``(B, n)``.
+        substeps: in continuous time, parts of a period; None: as the prover says.
     """
 
     index: int
     cell_reference: Tensor
     references: Tensor
     cells: Box
+    substeps: int | None = None
 
     def __len__(self) -> int:
         return len(self.cell_reference)
@@ -56,6 +63,8 @@ class Chunk:
             "lower": self.cells.lower,
             "upper": self.cells.upper,
         }
+        if self.substeps is not None:
+            found["substeps"] = torch.tensor(self.substeps)
         return {name: tensor.numpy() for name, tensor in found.items()}
 
     @classmethod
@@ -64,7 +73,8 @@ class Chunk:
         owner, references, lower, upper = (
             torch.from_numpy(arrays[name].copy()) for name in ("cell_reference", "references", "lower", "upper")
         )
-        return cls(index, owner, references, Box(lower, upper))
+        substeps = int(arrays["substeps"]) if "substeps" in arrays else None
+        return cls(index, owner, references, Box(lower, upper), substeps)
 
 
 @dataclass(frozen=True)
@@ -79,6 +89,7 @@ class CellTubes:
         seconds: share of the propagation time, ``(C,)``.
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
         notes: of the propagator.
+        flow: in continuous time, what was proved between the instants.
     """
 
     cell_reference: Tensor
@@ -89,6 +100,7 @@ class CellTubes:
     seconds: Tensor
     recording: Recording | None
     notes: tuple[str, ...] = ()
+    flow: Flow | None = None
 
     def __len__(self) -> int:
         return len(self.cell_reference)
@@ -104,6 +116,7 @@ class CellTubes:
             self.seconds[index],
             None if self.recording is None else self.recording.select(index),
             self.notes,
+            None if self.flow is None else self.flow.select(index),
         )
 
     @staticmethod
@@ -121,6 +134,7 @@ class CellTubes:
             torch.cat([p.seconds for p in parts]),
             Recording.join(recordings),
             tuple(dict.fromkeys(note for p in parts for note in p.notes)),
+            Flow.join([p.flow for p in parts]),
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -139,6 +153,8 @@ class CellTubes:
             r = self.recording
             found |= {"slope": r.slope, "offset": r.offset, "radius": r.radius}
             found |= {} if r.kept is None else {"kept": r.kept}
+        if self.flow is not None:
+            found |= {f"flow_{name}": side for name, side in self.flow.arrays().items()}
         arrays = {name: tensor.detach().numpy() for name, tensor in found.items()}
         if self.recording is not None:
             arrays["operations"] = np.array(self.recording.operations, dtype=np.str_)
@@ -174,6 +190,9 @@ class CellTubes:
             found["seconds"],
             recording,
             tuple(str(note) for note in arrays.get("notes", ())),
+            Flow.of({name.removeprefix("flow_"): side for name, side in found.items()})
+            if "flow_lower" in found
+            else None,
         )
 
 
@@ -187,12 +206,14 @@ class CellProver:
         tracker: the policy, which stays as it is once something is proved of it.
         compared: whether the loop is that of the analytical model of a learned robot, by way of the robot:
             :class:`~sagemp_cli.verification.deviation.ComparedLoop`.
+        division: in continuous time, how the periods are to be divided.
     """
 
     propagator: Propagator
     problem: Problem
     tracker: Controller
     compared: bool = False
+    division: AskedDivision = AskedDivision()
 
     def loop(self, references: Tensor) -> ClosedLoop:
         """What is bounded, on references ``(..., K+1, n)``."""
@@ -203,13 +224,16 @@ class CellProver:
         # Recorded once: a chunk has other numbers and no other step. It goes along to other processes if it is there.
         return step_of(self.problem, self.tracker, compared=self.compared)
 
+    @functools.cached_property
+    def _sampled(self) -> SampledLoop:
+        return sampled_of(self.problem, self.tracker)
+
     def prove(self, chunk: Chunk) -> CellTubes:
         """Bound states and controls of every cell, with one thread wherever it runs."""
         loop = self.loop(chunk.references)
         began = time.perf_counter()
         with torch.no_grad(), one_thread():
-            known = RecordedLoop(self._programs, loop.numbers().to(torch.float64), loop.horizon)
-            found = self.propagator.reach(known, chunk.cells, self.problem.disturbance, watch=True)
+            found = self._reach(loop, chunk)
             u_lower, u_upper = found.control_lower, found.control_upper
             if u_lower is None or u_upper is None:
                 shape = (len(chunk), loop.horizon, loop.dynamics.control_dim)
@@ -222,13 +246,42 @@ class CellProver:
         share = (time.perf_counter() - began) / len(chunk)
         seconds = torch.full((len(chunk),), share, dtype=torch.float64)
         return CellTubes(
-            chunk.cell_reference, chunk.cells, found.tube, u_lower, u_upper, seconds, found.recording, found.notes
+            chunk.cell_reference,
+            chunk.cells,
+            found.tube,
+            u_lower,
+            u_upper,
+            seconds,
+            found.recording,
+            found.notes,
+            found.flow,
         )
+
+    def _reach(self, loop: ClosedLoop, chunk: Chunk) -> Reach:
+        numbers, w = loop.numbers().to(torch.float64), self.problem.disturbance
+        if not loop.continuous:
+            known = RecordedLoop(self._programs, numbers, loop.horizon)
+            return self.propagator.reach(known, chunk.cells, w, watch=True)
+        if self.compared:
+            raise UsageError(
+                "what is proved about a learned robot's analytical model is in discrete time; set "
+                "verify.true_model=null, or dynamics.time=discrete"
+            )
+        known = dataclasses.replace(self._sampled, numbers=numbers, horizon=loop.horizon)
+        substeps = chunk.substeps or self.division.substeps
+        return reach_continuously(self.propagator, known, chunk.cells, w, substeps=substeps, order=self.division.order)
 
 
 def loop_of(problem: Problem, tracker: Controller, references: Tensor, *, compared: bool = False) -> ClosedLoop:
     """The loop of a problem under a tracker; see :class:`CellProver`."""
     return (ComparedLoop if compared else ClosedLoop)(problem.dynamics, tracker, references)
+
+
+@torch.no_grad()
+def sampled_of(problem: Problem, tracker: Controller) -> SampledLoop:
+    """The ODE and the control of :func:`loop_of` in continuous time as programs, the same whatever the references."""
+    any_reference = torch.zeros(problem.horizon + 1, problem.dynamics.state_dim, dtype=torch.float64)
+    return sampled(loop_of(problem, tracker, any_reference), problem.start)
 
 
 @torch.no_grad()

@@ -135,7 +135,7 @@ def verify_loop(
             work,
             Box(seen.start.lower[None], seen.start.upper[None]),
             budget=budget,
-            shortfall=lambda tube: _shortfall(tube, claim),
+            shortfall=lambda found: _shortfall(found.tube, claim),
             hopeless=lambda owner, cells: _breaks(seen, claim, cells),
         )
     else:

@@ -94,7 +94,7 @@ def assess(
     position: Sequence[int],
     state_names: Sequence[str],
     between: Between = Between.SEGMENTS,
-    bulge: Bulge | None = None,
+    lines: tuple[Tube, Bulge] | None = None,
 ) -> Assessment:
     """Judge the tubes ``(C, K+1, n)`` of the cells of R references; those of one together cover its start box.
 
@@ -111,7 +111,8 @@ def assess(
         position: indices of the states that are the position.
         state_names: names for messages, n of them.
         between: with ``SAMPLES`` the states at the samples have to keep clear and nothing else.
-        bulge: what leaves the straight lines between the samples, ``(C, K, n)``.
+        lines: boxes at S equal parts of every step, ``(C, K S + 1, n)``, and what leaves the straight lines between
+            them, ``(C, K S, n)``, where that is known better than by the samples; see :class:`.Flow`.
 
     Raises:
         UsageError: a reference without cells, of which nothing is proved.
@@ -119,8 +120,9 @@ def assess(
     count = int(cell_reference.max()) + 1 if len(cell_reference) else 0
     if len(cell_reference) != len(tube.lower) or not torch.equal(cell_reference.unique(), torch.arange(count)):
         raise UsageError(f"every one of {count} references needs cells, and every cell a reference")
-    found = _measure(tube, scene, position, between, bulge)
+    found = _measure(tube, scene, position, between, lines)
     parts = 1 if between is Between.SAMPLES else PARTS
+    parts = parts if lines is None else parts * (lines[0].horizon // tube.horizon)
     clearances = _least(found.clearances, cell_reference, count)  # (R, parts of all steps, constraints)
     goal_margin = _least(found.goal_margin, cell_reference, count)
     reaches = _least(found.reaches, cell_reference, count)
@@ -149,7 +151,7 @@ def shortfall(
     *,
     position: Sequence[int],
     between: Between = Between.SEGMENTS,
-    bulge: Bulge | None = None,
+    lines: tuple[Tube, Bulge] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """How far each of the tubes ``(C, K+1, n)`` is from being SAFE by itself.
 
@@ -158,7 +160,7 @@ def shortfall(
         the sum over all constraints, faces of the goal and steps (of each the mean over its parts) of
         ``log(1 + depth)``. It guides, it proves nothing.
     """
-    found = _measure(tube, scene, position, between, bulge)
+    found = _measure(tube, scene, position, between, lines)
     safe = found.finite.flatten(1).all(1) & (found.clearances > 0).flatten(1).all(1) & found.reaches
     depth = torch.log1p((-found.clearances).clamp(min=0.0, max=_HUGE)).mean(1).sum(1) * (tube.horizon + 1)
     short = torch.log1p((-found.goal_margin).clamp(min=0.0, max=_HUGE)).sum(1)
@@ -179,10 +181,17 @@ class _Measures:
     reaches: Tensor
 
 
-def _measure(tube: Tube, scene: Scene, position: Sequence[int], between: Between, bulge: Bulge | None) -> _Measures:
+def _measure(
+    tube: Tube, scene: Scene, position: Sequence[int], between: Between, lines: tuple[Tube, Bulge] | None
+) -> _Measures:
+    if between is Between.CONTINUOUS and lines is None:
+        raise UsageError("a claim about all times needs to know what solutions do between the samples")
     finite = torch.isfinite(tube.lower) & torch.isfinite(tube.upper)
-    if bulge is not None:  # a step over which nothing is known ends unbounded
-        finite = torch.cat([finite[..., :1, :], finite[..., 1:, :] & bulge.known], dim=-2)
+    if lines is not None:  # a step over which nothing is known ends unbounded
+        fine, bulge = lines
+        known = bulge.known & torch.isfinite(fine.lower[..., 1:, :]) & torch.isfinite(fine.upper[..., 1:, :])
+        known = known.unflatten(-2, (tube.horizon, -1)).all(-2)
+        finite = torch.cat([finite[..., :1, :], finite[..., 1:, :] & known], dim=-2)
     everywhere = torch.full_like(tube.lower, torch.inf)
     lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
     index = list(position)
@@ -190,7 +199,11 @@ def _measure(tube: Tube, scene: Scene, position: Sequence[int], between: Between
     if between is Between.SAMPLES:
         over = Box(places.lower, places.upper)
     else:
-        bends = None if bulge is None else Bulge(*(b[..., index] for b in (bulge.curve, bulge.swing, bulge.rest)))
+        bends = None
+        if lines is not None:
+            fine, bulge = lines
+            places = Tube(fine.lower[..., index], fine.upper[..., index])
+            bends = Bulge(*(b[..., index] for b in (bulge.curve, bulge.swing, bulge.rest)))
         parts = over_steps(places, bends)
         over = Box(parts.lower.flatten(-3, -2), parts.upper.flatten(-3, -2))
     goal_margin = torch.minimum(

@@ -17,9 +17,11 @@ from torch import Tensor
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
+from sagemp_cli.problem import Problem
 from sagemp_cli.progress import Progress, Silent
+from sagemp_cli.reachability.flow import Flow
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets import Between, Box, Tube
+from sagemp_cli.sets import Between, Box, Bulge, Tube
 from sagemp_cli.sets.partition import partition, uncertain_dimensions
 from sagemp_cli.verification.adaptive import adaptive_cells
 from sagemp_cli.verification.cells import CellProver, CellTubes, Chunk, Pieces, Run
@@ -50,6 +52,7 @@ class Verification:
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
         notes: of the propagator, one line each.
         between: what the verdicts say of the time between two samples.
+        flow: in continuous time, what was proved between the instants.
     """
 
     references: Tensor
@@ -70,6 +73,7 @@ class Verification:
     recording: Recording | None = None
     notes: tuple[str, ...] = ()
     between: Between = Between.SEGMENTS
+    flow: Flow | None = None
 
     def __len__(self) -> int:
         return self.references.shape[0]
@@ -104,6 +108,7 @@ class Verification:
             goal_margin=self.goal_margin[i],
             seconds=self.seconds[i],
             recording=None if self.recording is None else self.recording.select(cells),
+            flow=None if self.flow is None else self.flow.select(cells),
         )
 
     @staticmethod
@@ -129,6 +134,7 @@ class Verification:
             goal_margin=cat([p.goal_margin for p in parts]),
             seconds=cat([p.seconds for p in parts]),
             recording=Recording.join([p.recording for p in parts]),
+            flow=Flow.join([p.flow for p in parts]),
             notes=tuple(dict.fromkeys(note for p in parts for note in p.notes)),
         )
 
@@ -198,7 +204,13 @@ def verify_references(
                 work,
                 start,
                 budget=budget,
-                shortfall=lambda tube: shortfall(tube, scene, position=dynamics.position, between=problem.between),
+                shortfall=lambda found: shortfall(
+                    found.tube,
+                    scene,
+                    position=dynamics.position,
+                    between=problem.between,
+                    lines=_lines(found, problem),
+                ),
                 hopeless=lambda owner, cells: _breaks(prover, references[owner], cells),
             )
         else:
@@ -212,6 +224,7 @@ def verify_references(
         position=dynamics.position,
         state_names=dynamics.state_names,
         between=problem.between,
+        lines=_lines(found, problem),
     )
     mine = [found.cell_reference == r for r in range(count)]
     return Verification(
@@ -233,7 +246,14 @@ def verify_references(
         recording=found.recording,
         notes=found.notes,
         between=problem.between,
+        flow=found.flow,
     )
+
+
+def _lines(found: CellTubes, problem: Problem) -> tuple[Tube, Bulge] | None:
+    """In continuous time, boxes and bulges between which the states are."""
+    flow = found.flow
+    return None if flow is None else flow.lines(found.tube, problem.disturbance, problem.dynamics.dt)
 
 
 class _Work:
@@ -245,28 +265,42 @@ class _Work:
         self.run, self.references, self.cells_at_once = run, references, cells_at_once
         self.pieces, self.progress, self.chunks = pieces, progress, 0
         self.seconds = torch.zeros(len(references), dtype=torch.float64)
+        self.substeps: int | None = None
 
     def __call__(self, owner: Tensor, cells: Box) -> CellTubes:
         """The tubes of cells ``(B, n)`` of references ``(B,)``, in their order."""
         chunks = [
-            Chunk(self.chunks + i, own, self.references[own], Box(lower, upper))
-            for i, (own, lower, upper) in enumerate(
-                zip(*(x.split(self.cells_at_once) for x in (owner, cells.lower, cells.upper)), strict=True)
+            Chunk(0, own, self.references[own], Box(lower, upper), self.substeps)
+            for own, lower, upper in zip(
+                *(x.split(self.cells_at_once) for x in (owner, cells.lower, cells.upper)), strict=True
             )
         ]
+        found = self._proved(chunks, len(owner))
+        flows = [tubes.flow for tubes in found if tubes.flow is not None]
+        if flows:  # one division for all, as fine as any chunk needs
+            self.substeps = max(flow.division.substeps for flow in flows)
+            coarse = [i for i, flow in enumerate(flows) if flow.division.substeps < self.substeps]
+            again = [dataclasses.replace(chunks[i], substeps=self.substeps) for i in coarse]
+            for i, tubes in zip(coarse, self._proved(again, sum(map(len, again))), strict=True):
+                found[i] = tubes
+        joined = CellTubes.join(found)
+        self.seconds.index_add_(0, joined.cell_reference, joined.seconds)
+        return joined
+
+    def _proved(self, chunks: Sequence[Chunk], cells: int) -> list[CellTubes]:
+        """The tubes of chunks, numbered here."""
+        chunks = [dataclasses.replace(chunk, index=self.chunks + i) for i, chunk in enumerate(chunks)]
         self.chunks += len(chunks)
         kept = set() if self.pieces is None else set(self.pieces.finished)
         found = {c.index: CellTubes.of(self.pieces.load(c.index)) for c in chunks if self.pieces and c.index in kept}
         done = sum(map(len, found.values()))
-        with self.progress.task("propagating cells", len(owner), done) as task:
+        with self.progress.task("propagating cells", cells, done) as task:
             for index, tubes in self.run([c for c in chunks if c.index not in found]):
                 if self.pieces is not None:
                     self.pieces.save(index, tubes.arrays())
                 found[index] = tubes
                 task.advance(len(tubes))
-        joined = CellTubes.join([found[c.index] for c in chunks])
-        self.seconds.index_add_(0, joined.cell_reference, joined.seconds)
-        return joined
+        return [found[c.index] for c in chunks]
 
 
 def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
@@ -279,8 +313,9 @@ def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
     loop = prover.loop(references)
     w = problem.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
-        states, _ = loop.rollout(x, w)
-    clear = problem.scene.signed_distance_along(states[..., list(problem.dynamics.position)]) > 0
+        states, controls = loop.rollout(x, w)
+        path = problem.dynamics.path(states, controls, w)
+    clear = problem.scene.signed_distance_along(path[..., list(problem.dynamics.position)]) > 0
     return (~(clear.all(-1) & problem.scene.goal.contains(states[..., -1, :]))).any(0)
 
 

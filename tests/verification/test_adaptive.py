@@ -31,7 +31,8 @@ class Stretched:
         none = torch.zeros(len(owner), 1, 1, dtype=torch.float64)
         return CellTubes(owner, cells, tube, none, none, none[:, 0, 0], None)
 
-    def shortfall(self, tube):
+    def shortfall(self, found):
+        tube = found.tube
         missing = (tube.upper[:, 1, 0] - self.limit).clamp(min=0.0)
         return missing == 0, missing
 

@@ -74,15 +74,15 @@ def test_a_tube_that_passes_an_obstacle_between_two_samples_is_not_safe_and_the_
 def test_a_bulge_counts_and_what_is_not_known_of_it_clears_nothing(wrong):
     t = tube(CLEAR, (2.5, 3.5, 2.0, 3.0), GOAL)
     none = torch.zeros(1, 2, 3, dtype=torch.float64)
-    assert judge(t, bulge=Bulge(none, none, none)).verdicts[0].outcome is Outcome.SAFE
+    assert judge(t, lines=(t, Bulge(none, none, none))).verdicts[0].outcome is Outcome.SAFE
     bent = none.clone()
     bent[0, 1, 0] = 60.0
-    swung = judge(t, bulge=Bulge(bent, bent, none))
+    swung = judge(t, lines=(t, Bulge(bent, bent, none)))
     assert swung.verdicts[0].outcome is Outcome.MAY_COLLIDE and swung.verdicts[0].step == 1
-    assert judge(t, bulge=Bulge(none, none, bent)).verdicts[0].outcome is Outcome.MAY_COLLIDE
+    assert judge(t, lines=(t, Bulge(none, none, bent))).verdicts[0].outcome is Outcome.MAY_COLLIDE
     bent[0, 1, 0] = wrong
     for parts in ((none, none, bent), (none, bent, none), (bent, none, none)):
-        assert judge(t, bulge=Bulge(*parts)).verdicts == (Verdict(Outcome.UNBOUNDED, 2, "px"),)
+        assert judge(t, lines=(t, Bulge(*parts))).verdicts == (Verdict(Outcome.UNBOUNDED, 2, "px"),)
 
 
 def test_the_goal_is_closed_and_exact():

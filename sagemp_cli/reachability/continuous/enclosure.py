@@ -60,7 +60,7 @@ class Enclosure:
 
 @torch.no_grad()
 def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> Enclosure:
-    """Of N parts that begin in these states ``(N, n)`` under these controls ``(N, m)``."""
+    """Of N parts that begin in these states ``(N, n)`` under these controls ``(N, m)``; w is ``(n,)`` or ``(N, n)``."""
     stay = _a_priori(programs, state, control, w)
     inside = _flowed(programs, state, stay, control, w)  # as an image it is no larger than what it was found in
     n, h, p = state.lower.shape[-1], programs.length, programs.division.order

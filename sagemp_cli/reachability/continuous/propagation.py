@@ -101,7 +101,7 @@ class _Block:
 
 @torch.no_grad()
 def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: Division) -> FlowRun:
-    """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``.
+    """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
 
     Rows of the tube after a period in which no enclosure was found are infinite.
     """
@@ -115,7 +115,8 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
     while at < loop.horizon:
         stop = min(at + length, loop.horizon)
         part = RecordedLoop((programs.step,), loop.numbers[at:stop], stop - at)
-        block = _block(affine, part, programs, here, states, w, guess)
+        signal = w if w.lower.dim() == 1 else Box(w.lower[at:stop], w.upper[at:stop])
+        block = _block(affine, part, programs, here, states, signal, guess)
         blocks.append(block)
         bad = ~block.holds
         first = torch.where(bad.any(1), bad.to(torch.int8).argmax(1) + at, loop.horizon)
@@ -125,7 +126,9 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
         guess = block.extrapolated()
         at, length = stop, min(2 * length, _LONGEST)
     run, rest = _joined([b.run for b in blocks]), loop.horizon - at
-    between = Flow.join([b.flow for b in blocks], 1).padded(rest).known_until(failed)
+    between = Flow.join([b.flow for b in blocks], 1)
+    assert between is not None
+    between = between.padded(rest).known_until(failed)
     tube = Tube(*(torch.nn.functional.pad(side, (0, 0, 0, rest)) for side in (run.tube.lower, run.tube.upper)))
     lost = (torch.arange(loop.horizon + 1) > failed[:, None])[..., None]
     tube = Tube(torch.where(lost, -torch.inf, tube.lower), torch.where(lost, torch.inf, tube.upper))
@@ -161,13 +164,12 @@ def _attempt(
     cells, n = start.lower.shape
     s, steps = programs.division.substeps, part.horizon
     guess = guess.expand(2, steps, cells, s, n)
-    sides = [
-        torch.cat([*[side.expand(steps, cells, s, n)] * 2, g], -1).flatten(-2)
-        for side, g in zip((w.lower, w.upper), guess, strict=True)
-    ]
+    signal = [side.expand(steps, n)[:, None, None].expand(steps, cells, s, n) for side in (w.lower, w.upper)]
+    sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
     run = affine.run(part, start, Box(*sides), watch=True, states=states)
     state, control = _boxes(run, n, s)
-    found = enclosure(programs, state, control, w)
+    each = Box(*(side.transpose(0, 1).reshape(-1, n) for side in signal))
+    found = enclosure(programs, state, control, w if w.lower.dim() == 1 else each)
 
     def shaped(side: Tensor) -> Tensor:
         return side.reshape(cells, steps, s, n)

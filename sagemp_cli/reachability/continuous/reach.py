@@ -10,9 +10,11 @@ import torch
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.expansion import expansion
 from sagemp_cli.reachability.continuous.propagation import FlowRun, propagated
 from sagemp_cli.reachability.continuous.sampled import Sampled, SampledLoop, sampled
 from sagemp_cli.reachability.flow import Division
+from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.sets import Box
 
@@ -35,7 +37,7 @@ def reach_continuously(
     order: int | None = None,
 ) -> Reach:
     """Enclosures at the instants and between them, of every solution from ``start (C, n)`` under every measurable
-    signal in ``w (n,)``.
+    signal in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
 
     Args:
         propagator: bounds the steps; ``affine``.
@@ -55,7 +57,7 @@ def reach_continuously(
         )
     known = sampled(loop, start)
     n, order = known.state_dim, ORDER if order is None else order
-    if start.lower.dim() != 2 or start.dim != n or w.lower.shape != (n,):
+    if start.lower.dim() != 2 or start.dim != n or w.lower.shape not in ((n,), (known.horizon, n)):
         raise UsageError(
             f"the start boxes must be (C, {n}) and the disturbance ({n},), found {tuple(start.lower.shape)} and "
             f"{tuple(w.lower.shape)}: in continuous time w is added to the rate of every state"
@@ -75,6 +77,18 @@ def reach_continuously(
             break
     assert best is not None
     return _result(best, known, propagator)
+
+
+def polynomial_steps(loop: Sampled | SampledLoop, start: Box, w: Box) -> tuple[RecordedLoop, Box]:
+    """The loop as steps of Taylor polynomials without their remainders, with their disturbance: no proof.
+
+    What comes out is differentiable by weights of the loop, where autograd is on.
+    """
+    known = sampled(loop, start)
+    step = expansion(known, Division(1, ORDER)).step
+    nothing = torch.zeros_like(w.lower)
+    sides = (torch.cat([side, side, nothing]) for side in (w.lower, w.upper))
+    return RecordedLoop((step,), known.numbers, known.horizon), Box(*sides)
 
 
 def _missing(found: FlowRun) -> int:

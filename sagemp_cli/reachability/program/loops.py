@@ -81,6 +81,11 @@ def recorded(loop: Loop, start: Box, disturbance: Box) -> RecordedLoop:
     """
     if isinstance(loop, RecordedLoop):
         return loop
+    if getattr(loop, "continuous", False):
+        raise UsageError(
+            "the loop is in continuous time, where a step is a simulated solution and no proof; its sets are found by "
+            "reach_continuously"
+        )
     steps = loop.horizon
     x, w = start.center.reshape(-1, start.dim)[0], disturbance.center.reshape(-1, disturbance.dim)[0]
     if _says_its_steps(loop):

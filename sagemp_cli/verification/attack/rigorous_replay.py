@@ -9,14 +9,17 @@ fraction s of a step, where the state is ``(1 - s) x_k + s x_{k+1}``, with s a n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.reach import reach_continuously
+from sagemp_cli.reachability.continuous.sampled import Sampled
 from sagemp_cli.reachability.propagator import Loop
-from sagemp_cli.sets import Between, Box, Tube, round_down, round_up
+from sagemp_cli.sets import Between, Box, Bulge, Tube, round_down, round_up
 from sagemp_cli.sets.between import at_fraction, exact_fraction
 
 
@@ -60,10 +63,13 @@ class Replay:
     Attributes:
         problem: what is claimed, with X_I ``(n,)``.
         tube: around its states, ``(K+1, n)``; None if nothing is certain of it.
+        lines: in continuous time, around its states at S parts of every period, ``(K S + 1, n)``, and how far it leaves
+            the straight lines between them.
     """
 
     problem: Problem
     tube: Tube | None
+    lines: tuple[Tube, Bulge] | None = None
 
     @classmethod
     def of(cls, loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) -> Replay:
@@ -80,8 +86,22 @@ class Replay:
         if bool(_unknown(problem.disturbance).any()):
             return cls(problem, None)
         first = Box(torch.where(loose, around.lower, start), torch.where(loose, around.upper, start))
+        if problem.between is Between.CONTINUOUS:
+            return cls._of_solution(cast(Sampled, loop), first, disturbances, problem)
         still = Box.around([0.0] * problem.disturbance.dim, [0.0] * problem.disturbance.dim)
         return cls(problem, Affine().propagate(OneRollout(loop, disturbances), first, still))
+
+    @classmethod
+    def _of_solution(cls, loop: Sampled, start: Box, disturbances: Tensor, problem: Problem) -> Replay:
+        """In continuous time, with a signal that is constant on every period."""
+        cell, w = Box(start.lower[None], start.upper[None]), Box(disturbances, disturbances)
+        found = reach_continuously(Affine(), loop, cell, w, order=_ORDER)
+        if found.flow is None:
+            return cls(problem, None)
+        tube = Tube(found.tube.lower[0], found.tube.upper[0])
+        fine, bulge = found.flow.lines(found.tube, w, loop.period)
+        bulge = Bulge(*(part[0] if part.dim() > 2 else part for part in (bulge.curve, bulge.swing, bulge.rest)))
+        return cls(problem, tube, (Tube(fine.lower[0], fine.upper[0]), bulge))
 
     def broken(self, fractions: Tensor) -> Tensor:
         """Which constraint is certainly broken at which step, ``(K+1, C)``: [workspace, obstacles..., goal].
@@ -98,13 +118,31 @@ class Replay:
             return out
         goal, tube = self.problem.scene.goal, self.tube
         out[-1, -1] = ((tube.lower[-1] > goal.upper) | (tube.upper[-1] < goal.lower)).any()
-        places = self._places()
+        places = self._places(tube)
         for c in range(columns):
             if self.problem.between is Between.SAMPLES:
                 out[:, c] = self._breaks(c, Box(places.lower, places.upper))
             else:
-                out[:-1, c] = self._breaks(c, at_fraction(places, exact_fraction(fractions[:, c])))
+                out[:-1, c] = self._breaks(c, self._at(torch.arange(steps), fractions[:, c]))
         return out
+
+    def _at(self, step: Tensor, fraction: Tensor) -> Box:
+        """Boxes ``(k, d)`` around the positions at fractions ``(k,)`` of steps ``(k,)``."""
+        assert self.tube is not None
+        tube, bulge = (self.tube, None) if self.lines is None else self.lines
+        parts = tube.horizon // self.tube.horizon
+        part = (fraction * parts).floor().clamp(max=parts - 1)
+        row, s = step * parts + part.long(), exact_fraction(fraction * parts - part)
+        places = self._places(tube)
+        ends = [torch.stack([side[row], side[row + 1]], -2) for side in (places.lower, places.upper)]
+        found = at_fraction(Tube(*ends), s[:, None])
+        low, high = found.lower[:, 0], found.upper[:, 0]
+        if bulge is not None:
+            index = list(self.problem.dynamics.position)
+            curve, swing, rest = (part[row][:, index] for part in (bulge.curve, bulge.swing, bulge.rest))
+            off = round_up(round_up(round_up((s * (1 - s))[:, None] * round_up(curve + swing))) + rest)
+            low, high = round_down(low - off), round_up(high + off)
+        return Box(low, high)
 
     def first(self, step: int, constraint: int, fraction: float) -> float:
         """The earliest fraction of a step that is found at which a constraint is certainly broken.
@@ -116,21 +154,19 @@ class Replay:
             step, constraint: which :meth:`broken` says is.
             fraction: at which it is.
         """
-        places = self._places()
-        line = Tube(places.lower[step : step + 2], places.upper[step : step + 2])
+        at = torch.tensor([step])
         begin, end = 0.0, float(exact_fraction(torch.tensor(fraction, dtype=torch.float64)))
         for s in (begin, *[None] * _HALVINGS):
             middle = exact_fraction(torch.tensor([0.5 * (begin + end) if s is None else s], dtype=torch.float64))
-            if bool(self._breaks(constraint, at_fraction(line, middle))):
+            if bool(self._breaks(constraint, self._at(at, middle))):
                 end = float(middle)
             else:
                 begin = float(middle)
         return end
 
-    def _places(self) -> Tube:
-        assert self.tube is not None
+    def _places(self, tube: Tube) -> Tube:
         index = list(self.problem.dynamics.position)
-        return Tube(self.tube.lower[..., index], self.tube.upper[..., index])
+        return Tube(tube.lower[..., index], tube.upper[..., index])
 
     def _breaks(self, constraint: int, p: Box) -> Tensor:
         """Whether all of position boxes ``(..., d)`` certainly breaks the workspace (0) or an obstacle (1, ...)."""
@@ -141,6 +177,8 @@ class Replay:
 
 
 _HALVINGS = 25
+_ORDER = 5
+"""Degree of the Taylor polynomials, in continuous time: one rollout costs little, and is to be known closely."""
 
 
 def _unknown(box: Box) -> Tensor:
