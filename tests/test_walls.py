@@ -7,6 +7,7 @@ a step is long, so most walls stand between two samples of every rollout.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from fractions import Fraction
 
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 from sagemp_cli.checker.balls import BITS, ctx
+from sagemp_cli.checker.between import Line, boxes_of
 from sagemp_cli.checker.clearance import clearances
 from sagemp_cli.checker.scene import SafeSet
 from sagemp_cli.dynamics.unicycle import Unicycle
@@ -178,12 +180,13 @@ def test_safety_rates_count_rollouts_that_drive_through(tracker, walls, referenc
 
 def test_a_certificate_that_calls_a_wall_kept_clear_of_is_not_proved(proved, walls, driven_through):
     """The checker's own account of the lines, in balls, on the tube and walls alone."""
-    lower, upper = (side[..., :2].numpy() for side in (proved.tube.lower, proved.tube.upper))
+    cells = zip(proved.tube.lower[..., :2].numpy(), proved.tube.upper[..., :2].numpy(), strict=True)
+    lines = [Line(*ends) for lower, upper in cells for ends in itertools.pairwise(boxes_of(lower, upper))]
     for wall, crossed in zip(walls, driven_through, strict=True):
         mapping = {"kind": "block", "name": wall.name, "lower": list(wall.lower), "upper": list(wall.upper)}
         safe = SafeSet.of({"obstacles": [mapping]})
         with ctx.workprec(BITS):
-            [distance] = clearances(safe, lower, upper, between="segments", parts=8)
+            [distance] = clearances(safe, lines, 8)
         assert not (crossed and distance > 0)
         [mine] = judged(proved, wall).clearance[0, 1:].tolist()
         assert float(distance) == pytest.approx(mine, abs=1e-12) and mine <= float(distance)

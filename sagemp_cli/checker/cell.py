@@ -82,7 +82,9 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None =
                     asked = [_both(a, b) for a, b in zip(step.bounds(control), ranges[which], strict=True)]
                 m = claim.control_lower.shape[1]
                 _require_inside(asked[:m], claim.control_lower[k], claim.control_upper[k], "control")
-                if parts is not None and claim.flow is not None:
+                if parts is not None:
+                    if claim.flow is None:
+                        raise Unproved("nothing is said of the flow between the instants")
                     begin = states.bounds() if k else list(zip(balls(claim.lower), balls(claim.upper), strict=True))
                     _prove_period(parts, claim.flow, k, begin, asked[:m], asked[m:])
                 if claim.deviation is not None:

@@ -17,7 +17,10 @@ from sagemp_cli.checker.clearance import clearances, goal_margins
 from sagemp_cli.checker.counterexample import Ends, applies, prove_violation
 from sagemp_cli.checker.cover import covered
 from sagemp_cli.checker.document import Document, read_document
+from sagemp_cli.checker.lines import lines_of
 from sagemp_cli.checker.loop import Folded
+from sagemp_cli.checker.ode import Flow
+from sagemp_cli.checker.part import FlowClaim
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.checker.unproved import Unproved
@@ -235,7 +238,7 @@ def _geometry(
     document: Document, safe: SafeSet, claims: Sequence[int]
 ) -> tuple[dict[int, str], dict[int, tuple[dict[str, float], dict[str, float]]]]:
     """Of each reference claimed SAFE what does not hold of cells, scene and figures, and the margins proved."""
-    tubes, index, names = document.tubes, list(document.position), document.state_names
+    tubes, names = document.tubes, document.state_names
     reasons, margins = {}, {}
     for r in claims:
         own = tubes["cell_reference"] == r
@@ -248,8 +251,8 @@ def _geometry(
                 raise Unproved("its tube is not finite")
             if tubes["step"][r] != -1 or tubes["fraction"][r] != 0 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
-            places = (side[..., index] for side in (lower, upper))
-            distances = clearances(safe, *places, between=document.between, parts=document.parts)
+            lines = [line for c in np.flatnonzero(own).tolist() for line in lines_of(document, c)]
+            distances = clearances(safe, lines, document.parts)
             for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
                 if not distance > 0:
                     raise Unproved(f"its tube is not clear of '{name}'")
@@ -283,23 +286,19 @@ def _reach_sets(
     jobs = (_claim(document, c) for c in cells)
     with progress.task("checking cells", len(cells)) as task:
         if processes <= 1 or len(cells) < 2:
-            folded = _fold(document.programs)
+            folded = _fold(document.steps)
             for c, claim in zip(cells, jobs, strict=True):
-                reason = prove_cell(claim, folded)
+                reason = prove_cell(claim, folded, document.ode)
                 task.advance(1)
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
             return
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(
-            min(processes, len(cells)), mp_context=context, initializer=_begin, initargs=(document.programs,)
+            min(processes, len(cells)), mp_context=context, initializer=_begin, initargs=(document.steps, document.ode)
         ) as pool:
             for c, reason in zip(cells, pool.map(_prove_elsewhere, jobs), strict=True):
                 task.advance(1)
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
-
-
-_FOLDED: list[Folded] = []
-"""Of a worker process: its programs."""
 
 
 def _fold(programs: Sequence[Program]) -> list[Folded]:
@@ -307,12 +306,16 @@ def _fold(programs: Sequence[Program]) -> list[Folded]:
         return [Folded.of(program) for program in programs]
 
 
-def _begin(programs: Sequence[Program]) -> None:
-    _FOLDED[:] = _fold(programs)
+_KNOWN: list[tuple[list[Folded], Flow | None]] = []
+"""Of a worker process: its programs."""
+
+
+def _begin(programs: Sequence[Program], ode: Flow | None) -> None:
+    _KNOWN[:] = [(_fold(programs), ode)]
 
 
 def _prove_elsewhere(claim: CellClaim) -> str:
-    return prove_cell(claim, _FOLDED)
+    return prove_cell(claim, *_KNOWN[0])
 
 
 def _claim(document: Document, c: int) -> CellClaim:
@@ -327,18 +330,25 @@ def _claim(document: Document, c: int) -> CellClaim:
         tube_upper=tubes["tube_upper"][c],
         control_lower=tubes["control_lower"][r],
         control_upper=tubes["control_upper"][r],
-        disturbance_lower=_at_every_step(tubes["disturbance_lower"], document.horizon),
-        disturbance_upper=_at_every_step(tubes["disturbance_upper"], document.horizon),
+        disturbance_lower=_disturbance(document, c, "lower"),
+        disturbance_upper=_disturbance(document, c, "upper"),
         slope=found["slope"][c],
         offset=found["offset"][c],
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
+        flow=FlowClaim(**{name: side[c] for name, side in document.flow.items()}) if document.flow else None,
     )
 
 
-def _at_every_step(side: np.ndarray, steps: int) -> np.ndarray:
-    return np.broadcast_to(side, (steps, len(side)))
+def _disturbance(document: Document, c: int, side: str) -> np.ndarray:
+    """A side of what steps are given, ``(K, d)``: W; in continuous time of each part two means in W and a remainder."""
+    w = document.tubes[f"disturbance_{side}"]
+    if document.ode is None:
+        return np.broadcast_to(w, (document.horizon, len(w)))
+    rest = document.flow[f"remainder_{side}"][c]
+    mean = np.broadcast_to(w, rest.shape)
+    return np.concatenate([mean, mean, rest], axis=-1).reshape(document.horizon, -1)
 
 
 def _finding(

@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from sagemp_cli.checker.between import SAMPLES
+from sagemp_cli.checker.between import CONTINUOUS, SAMPLES
 from sagemp_cli.checker.document import Document
-from sagemp_cli.checker.equations import Names, equations, matrix_of
+from sagemp_cli.checker.equations import Names, control_equations, equations, matrix_of, rate_equations
+from sagemp_cli.checker.ode import Flow
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet
 
 _NETWORK = 8  # rows and columns from which on a matrix is called a network's
 _MOST_REFERENCES = 12
+_MOST_EQUATIONS, _LONGEST_EQUATION = 24, 160  # of an ODE that is printed in full
 
 
 def claim_lines(document: Document, title: str) -> list[str]:
@@ -35,22 +37,24 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     names, units = document.state_names, document.state_units
     w_names = disturbance_names(document)
     rows = [
-        ("for", f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {document.horizon} steps"),
+        ("for", _times(document)),
         *([("between", _between(document))] if safe.names else []),
         ("X_I", _box(*sets[0].corners(), names, units)),
         ("W", _box(*sets[1].corners(), w_names, [""] * len(w_names))),
-        *[("w enters", text) for text in [_entrance(document)] if text],
-        *_models(document),
+        *([("w enters", text) for text in [_entrance(document)] if text] if document.ode is None else []),
+        *(_models(document) if document.ode is None else _ode(document, document.ode)),
     ]
     tubes = document.tubes
     safe_ones = [r for r, v in enumerate(tubes["verdict"]) if v == "SAFE"] or list(range(len(tubes["verdict"])))
-    rows.append(("proves", _aims(safe)))
+    rows.append(
+        ("proves", _aims(safe, "x_k stays in its tube" if document.ode is None else "x(k dt) stays in its tube"))
+    )
     if safe.workspace is not None:
         places = [names[i] for i in document.position], [units[i] for i in document.position]
         rows.append(("workspace", _box(*safe.workspace, *places)))
     rows += [("obstacle", _obstacle(o)) for o in safe.obstacles]
     if safe.goal is not None:
-        rows.append(("goal at K", _box(*safe.goal, names, units)))
+        rows.append(("goal at K" if document.ode is None else "goal at K dt", _box(*safe.goal, names, units)))
     if document.control_names and safe_ones:
         lower, upper = tubes["control_lower"][safe_ones].min((0, 1)), tubes["control_upper"][safe_ones].max((0, 1))
         rows.append(("controls", _box(lower, upper, document.control_names, document.control_units)))
@@ -61,13 +65,58 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
         ]
         if len(tubes["references"]) > _MOST_REFERENCES:
             rows.append(("references", f"{len(tubes['references']) - _MOST_REFERENCES} more"))
+    if document.ode is not None:
+        rows.append(("how it is proved", _method(document, document.ode)))
     return rows
+
+
+def _times(document: Document) -> str:
+    """What a claim quantifies over, and when it holds."""
+    steps, dt = document.horizon, document.dt
+    if document.ode is None or dt is None:
+        return f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {steps} steps"
+    return (
+        f"all starts x(0) in X_I, all measurable w(t) in W and all times t in [0, K dt] = [0, {steps * dt:.6g}] s, "
+        f"K = {steps} periods of dt = {dt:.6g} s"
+    )
+
+
+def _ode(document: Document, ode: Flow) -> list[tuple[str, str]]:
+    """The right-hand side, in full if it is not long, and how the control is held."""
+    rate = rate_equations(ode.rate, _names(document))
+    if len(rate) > _MOST_EQUATIONS or max(map(len, rate), default=0) > _LONGEST_EQUATION:
+        chain = _chain(ode.rate, sorted(_behind(ode.rate, ode.rate.next)))
+        rate = [f"x'(t) = f(x(t), u_k) + w(t), f {chain}; its equations: sagemp inspect --equations"]
+    rows = [("ODE", text) for text in rate]
+    rows.append(("rate program", f"sha256 {ode.rate.fingerprint()[:16]}"))
+    (control,) = document.programs
+    if control.control >= 0:
+        chain = _chain(control, sorted(_behind(control, control.control)))
+        rows.append(("control", f"of x(t_k) at t_k = k dt, held on [t_k, t_k + dt]; {chain}"))
+        rows.append(
+            ("control program", f"sha256 {control.fingerprint()[:16]}, its equations: sagemp inspect --equations")
+        )
+    return rows
+
+
+def _method(document: Document, ode: Flow) -> str:
+    parts = "each period as a whole" if ode.substeps == 1 else f"each period in {ode.substeps} parts"
+    return (
+        f"{parts}, Taylor polynomials of degree {ode.order} with proved remainders, {document.parts} boxes along each; "
+        f"{len(document.tubes['cell_reference'])} cells"
+    )
+
+
+def _names(document: Document) -> Names:
+    return Names(document.state_names, document.control_names, disturbance_names(document))
 
 
 def _between(document: Document) -> str:
     """What is claimed of the time between two samples."""
     if document.between == SAMPLES:
         return "samples: the safe set is kept at the samples; of the time between them NOTHING is claimed"
+    if document.between == CONTINUOUS:
+        return "continuous: the safe set is kept at all of these times, by every solution of the ODE; the goal at K dt"
     return (
         f"segments: the safe set is kept over the whole of every step, on the straight line from x_k to x_k+1 "
         f"({document.parts} parts a step); the goal at step K"
@@ -80,7 +129,7 @@ def said_rows(document: Document) -> list[tuple[str, str]]:
     said = {
         **document.said,
         "robot": str(robot.get("name", "?"))[:80] if isinstance(robot, Mapping) else None,
-        "between samples": None if document.dt is None else f"{document.dt:.6g} s",
+        "between samples": None if document.dt is None or document.ode is not None else f"{document.dt:.6g} s",
         "names, units": "of states and controls",
     }
     return [(key, f"{value:.6g}" if isinstance(value, float) else str(value)) for key, value in said.items()
@@ -89,9 +138,11 @@ def said_rows(document: Document) -> list[tuple[str, str]]:
 
 def equation_lines(document: Document) -> list[str]:
     """The programs of a file as equations."""
-    names = Names(document.state_names, document.control_names, disturbance_names(document))
-    out: list[str] = []
-    for i, program in enumerate(document.programs):
+    names, out = _names(document), list[str]()
+    if document.ode is not None:
+        out += ["u_k, from x = x(t_k), held on [t_k, t_k + dt]:", *control_equations(document.programs[0], names)]
+        out += ["x'(t), at all times:", *rate_equations(document.ode.rate, names)]
+    for i, program in enumerate(document.programs if document.ode is None else ()):
         if len(document.programs) > 1:
             steps = np.flatnonzero(document.step_program == i)
             out.append(f"steps {', '.join(map(str, steps[:8]))}{', ...' if len(steps) > 8 else ''}:")
@@ -141,9 +192,9 @@ def _obstacle(obstacle: tuple[str, str, list[float], Any]) -> str:
     return f"{name}: block from ({place}) to ({', '.join(f'{v:.6g}' for v in second)})"
 
 
-def _aims(safe: SafeSet) -> str:
+def _aims(safe: SafeSet, first: str) -> str:
     """What a verdict of SAFE says."""
-    parts = ["x_k stays in its tube"]
+    parts = [first]
     if safe.workspace is not None:
         parts.append("in the workspace")
     parts.append(f"clear of {len(safe.obstacles)} obstacles" if safe.obstacles else "no obstacle is claimed")

@@ -2,43 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sagemp_cli.checker.balls import arb, ball
-from sagemp_cli.checker.between import SAMPLES, Sides, parts_of_step, samples_of, whole_step
+from sagemp_cli.checker.between import Line, Sides
 from sagemp_cli.checker.scene import Corners, SafeSet
 
 
-def clearances(safe: SafeSet, lower: np.ndarray, upper: np.ndarray, *, between: str, parts: int) -> list[arb]:
-    """Of tubes over the position ``(C, K+1, d)``: the least distance to each constraint (to a block: the largest gap).
+def clearances(safe: SafeSet, lines: Sequence[Line], parts: int) -> list[arb]:
+    """The least distance of what is near some lines over the position to each constraint (to a block: the largest gap).
 
-    Over the whole of every step, in so many parts, unless the samples only are asked for.
+    Each line is looked at in so many parts.
     """
-    tubes = [samples_of(low, high) for low, high in zip(lower, upper, strict=True)]
     distances: list[Callable[[Sides], arb]] = [] if safe.workspace is None else [partial(_inside, safe.workspace)]
     distances += [partial(_apart, obstacle) for obstacle in safe.obstacles]
-    if between == SAMPLES:
-        return [smallest([distance(box) for tube in tubes for box in tube]) for distance in distances]
-    steps = [pair for tube in tubes for pair in zip(tube[:-1], tube[1:], strict=True)]
-    return [_least(steps, distance, parts) for distance in distances]
+    return [_least(lines, distance, parts) for distance in distances]
 
 
-def _least(steps: list[tuple[Sides, Sides]], distance: Callable[[Sides], arb], parts: int) -> arb:
-    """The least distance over the parts of all steps.
+def _least(lines: Sequence[Line], distance: Callable[[Sides], arb], parts: int) -> arb:
+    """The least distance over the parts of all lines.
 
-    One box over a whole step is no farther away than its parts are: a step for which that is not below what is found
-    already cannot change the least, and the nearest steps come first.
+    One box over a whole line is no farther away than its parts are: a line for which that is not below what is found
+    already cannot change the least, and the nearest lines come first.
     """
-    known = sorted(((distance(whole_step(*step)), step) for step in steps), key=lambda pair: float(pair[0].mid()))
+    known = sorted(((distance(line.whole()), line) for line in lines), key=lambda pair: float(pair[0].mid()))
     found: arb | None = None
-    for whole, step in known:
+    for whole, line in known:
         if found is not None and whole >= found:
             continue
-        nearest = smallest([distance(box) for box in parts_of_step(*step, parts)])
+        nearest = smallest([distance(box) for box in line.parts(parts)])
         found = nearest if found is None else found.min(nearest)
     assert found is not None
     return found

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from sagemp_cli.checker.between import MOST_PARTS, SAMPLES, SEGMENTS
+from sagemp_cli.checker.between import CONTINUOUS, MOST_PARTS, SAMPLES, SEGMENTS
+from sagemp_cli.checker.ode import Flow, flow_of
 from sagemp_cli.checker.program import Instruction, Program
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.checker.unproved import Unproved
@@ -34,22 +35,25 @@ class Document:
         kind: ``certificate`` or ``library``.
         config: the resolved config.
         said: what the file says of itself beside its claim: experiment, stage, version, propagator and the like.
-        between: ``segments`` if the safe set is claimed to be kept over the whole of every step, or ``samples``.
-        parts: of a step, which are checked one by one.
+        between: ``segments`` if the safe set is claimed to be kept over the whole of every step, ``continuous`` if at
+            all times by the solutions of an ODE, or ``samples``.
+        parts: of a step, or of a part of a period, which are checked one by one.
         tubes: datasets of ``/data/tubes`` by name, texts as lists of str; ``references`` is None if there are none.
         relaxations: ``slope, offset, radius (cells, K, E)`` and perhaps ``kept``; empty if none are recorded.
-        programs: the step, one program or several.
+        programs: the step, one program or several; in continuous time the control.
         step_program: which of them each step is, ``(K,)``.
         lookahead: N; 0 if the step has no numbers of its own.
         state_names, state_units, control_names, control_units: n and m texts each.
         position: entries of the state that are the position in the scene.
         safe: the scene of the config.
         sets: X_I and W of the config.
-        dt: seconds between samples, as the file says; None if it does not.
+        dt: seconds between samples, as the file says; None if it does not. In continuous time it is part of the claim.
         verdict: of a certificate; empty for a library.
         counterexamples: attributes and datasets of each.
         deviation: of a learned robot from its analytical model, ``(R, K, n)``, if the claim is about that model.
         true_model: a learned robot's claim about its analytical model; the same file, other tubes and another program.
+        ode: in continuous time the loop's period as programs.
+        flow: in continuous time, datasets of ``/data/tubes/flow`` by name.
     """
 
     kind: str
@@ -74,6 +78,13 @@ class Document:
     counterexamples: tuple[Mapping[str, Any], ...]
     deviation: np.ndarray | None = None
     true_model: Document | None = None
+    ode: Flow | None = None
+    flow: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> tuple[Program, ...]:
+        """The programs of a step: of a period, in continuous time."""
+        return self.programs if self.ode is None else (self.ode.step,)
 
     @property
     def horizon(self) -> int:
@@ -144,6 +155,7 @@ def _read(file: Group, path: Path) -> Document:
     _, rows, n = tubes["tubes"]["tube_lower"].shape
     d = len(tubes["tubes"]["disturbance_lower"])
     loop = _loop(data.group("loop"), n, d, rows - 1)
+    ode = _ode(loop, loop.pop("rate"), tubes)
     document = Document(
         kind=schema.removeprefix("sagemp/"),
         config=config,
@@ -155,6 +167,7 @@ def _read(file: Group, path: Path) -> Document:
         **tubes,
         **loop,
         **_problem(config, n, d, loop, path),
+        ode=ode,
         verdict=str(data.attrs.get("verdict", "")),
         counterexamples=tuple(
             {**example.attrs, **{key: _dataset(example.dataset(key)) for key in example}}
@@ -164,6 +177,8 @@ def _read(file: Group, path: Path) -> Document:
     _require_fitting(document, path)
     if "true_model" not in data:
         return document
+    if ode is not None:
+        raise ArtifactError(f"{path}: a claim in continuous time has no /data/true_model")
     true = _tubes(data.group("true_model/tubes"), path)
     true.pop("said")
     if (true["between"], true["parts"]) != (document.between, document.parts):
@@ -188,13 +203,30 @@ _SAMPLES = ("drawn", "certified")
 _SAID = ("experiment", "stage", "status", "version", "created_utc", "seconds")
 
 
+def _ode(loop: Mapping[str, Any], rate: Program | None, tubes: Mapping[str, Any]) -> Flow | None:
+    """The period of a loop in continuous time, if it is one: then all of the file says so."""
+    flow, continuous = tubes["flow"], tubes["between"] == CONTINUOUS
+    if not continuous and rate is None and not flow:
+        return None
+    if not continuous or rate is None or not flow:
+        raise ValueError(
+            "a claim in continuous time needs 'between: continuous', its right-hand side /data/loop/rate, and "
+            "/data/tubes/flow"
+        )
+    _, _, substeps, n = flow["lower"].shape
+    if loop["dt"] is None or len(loop["programs"]) != 1 or len(tubes["tubes"]["disturbance_lower"]) != n:
+        raise ValueError("a claim in continuous time needs dt, one control, and a disturbance for every state")
+    order = int(flow.pop("order")[()])
+    return flow_of(loop["programs"][0], rate, period=loop["dt"], substeps=substeps, order=order)
+
+
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
     """What a group says of the loop, as fields of a :class:`Document`."""
-    _require_known(group, "programs", "step_program", "position", *_NAMES)
+    _require_known(group, "programs", "step_program", "position", "rate", *_NAMES)
     lookahead = int(group.attrs["lookahead"])
     if not 0 <= lookahead <= _MOST_LOOKAHEAD:
         raise ValueError(f"/data/loop: lookahead is {lookahead}")
@@ -210,6 +242,7 @@ def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
     if len(set(position.tolist())) != len(position):
         raise ValueError("/data/loop/position names a state twice")
     m = made[0].controls
+    rate = _program(group.group("rate"), n, d, m) if "rate" in group else None
     if any(program.controls != m for program in made):
         raise ValueError("/data/loop: its programs have different numbers of controls")
     names = {name: tuple(_dataset(group.dataset(name))) for name in _NAMES}
@@ -226,6 +259,7 @@ def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
         **names,
         "position": tuple(position.tolist()),
         "dt": float(group.attrs["dt"]) if "dt" in group.attrs else None,
+        "rate": rate,
     }
 
 
@@ -299,7 +333,7 @@ def _config(text: str) -> Any:
 
 def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
     """What a group of tubes holds, as fields of a :class:`Document`."""
-    _require_known(tubes, "references", "relaxations", *_SHAPES, *_TEXTS)
+    _require_known(tubes, "references", "relaxations", "flow", *_SHAPES, *_TEXTS)
     read = {name: _dataset(tubes.dataset(name)) for name in tubes if isinstance(tubes[name], Dataset)}
     read.setdefault("references", None)
     _require_shapes(read, path)
@@ -309,8 +343,8 @@ def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
         _require_known(recorded, "slope", "offset", "radius", "kept")
         relaxations = {name: _dataset(recorded.dataset(name)) for name in recorded}
     between, parts = str(tubes.attrs["between"]), int(tubes.attrs["parts"])
-    if between not in (SEGMENTS, SAMPLES):
-        raise ValueError(f"{tubes.name}: between is '{between[:40]}'; known are {SEGMENTS} and {SAMPLES}")
+    if between not in (SEGMENTS, SAMPLES, CONTINUOUS):
+        raise ValueError(f"{tubes.name}: between is '{between[:40]}'; known are {SEGMENTS}, {SAMPLES} and {CONTINUOUS}")
     if not 1 <= parts <= MOST_PARTS or (between == SAMPLES and parts != 1):
         raise ValueError(f"{tubes.name}: a step is checked in {parts} parts; 1 to {MOST_PARTS} can be")
     return {
@@ -319,7 +353,25 @@ def _tubes(tubes: Group, path: Path) -> dict[str, Any]:
         "tubes": read,
         "said": {name: _plain(tubes.attrs[name]) for name in ("propagator", "rigorous")},
         "relaxations": relaxations,
+        "flow": _flow(tubes.group("flow"), read["tube_lower"].shape) if "flow" in tubes else {},
     }
+
+
+_FLOW = ("lower", "upper", "remainder_lower", "remainder_upper", "curve", "drift")
+
+
+def _flow(group: Group, tube: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    """What a group says of the time between the samples; ``order`` beside the arrays."""
+    _require_known(group, "inner_lower", "inner_upper", *_FLOW)
+    substeps, order = int(group.attrs["substeps"]), int(group.attrs["order"])
+    cells, rows, n = tube
+    shapes = dict.fromkeys(_FLOW, (cells, rows - 1, substeps, n))
+    shapes |= dict.fromkeys(("inner_lower", "inner_upper"), (cells, rows - 1, substeps - 1, n))
+    found = {name: _dataset(group.dataset(name)) for name in shapes}
+    for name, shape in shapes.items():
+        if found[name].shape != shape or found[name].dtype != np.float64:
+            raise ValueError(f"{group.name}/{name} must be float64 of shape {shape}")
+    return found | {"order": np.array(order)}
 
 
 def _require_known(group: Group, *names: str) -> None:
@@ -382,7 +434,7 @@ def _require_fitting(document: Document, path: Path) -> None:
         raise ArtifactError(f"{path}: /data/loop looks {document.lookahead} steps ahead, but there are no references")
     if not found:
         return
-    most = max(program.relaxations for program in document.programs)
+    most = max(program.relaxations for program in document.steps)
     wanted = (cells, rows - 1, most)
     for name in ("slope", "offset", "radius"):
         if found[name].shape != wanted or found[name].dtype != np.float64:

@@ -39,13 +39,26 @@ def equations(program: Program, names: Names) -> list[str]:
 
     ``x'`` is the state after the step, ``ref`` the list of numbers that the step has of its own.
     """
+    writer = _Writer(program, names)
+    return [*writer.lines(), *writer.after()]
+
+
+def control_equations(program: Program, names: Names) -> list[str]:
+    """The same of a control alone."""
     return _Writer(program, names).lines()
+
+
+def rate_equations(program: Program, names: Names) -> list[str]:
+    """The same of a right-hand side of an ODE: ``x'`` is the rate of the state, the disturbance added to it."""
+    writer = _Writer(program, names, numbers=names.controls)
+    return [*writer.lines(), *writer.after(plus=names.disturbances)]
 
 
 @dataclass
 class _Writer:
     program: Program
     names: Names
+    numbers: Sequence[str] = ()
     out: list[str] = field(default_factory=list)
     texts: dict[int, list[str] | str] = field(default_factory=dict)
 
@@ -64,15 +77,23 @@ class _Writer:
             elif isinstance(text, list) and slot != program.next and instruction.kind not in _PLAIN:
                 text = self._named(slot, text, often=uses[slot] > 1)
             self.texts[slot] = text
+        return self.out
+
+    def after(self, plus: Sequence[str] = ()) -> list[str]:
+        """Of the next state, to which something may be added, and the deviation; what comes after all else."""
+        program, before = self.program, len(self.out)
+        if program.next not in self.texts:
+            return []
         after = self.texts[program.next]
         if isinstance(after, str):
-            self.out.append(f"x' = {after}")
+            self.out.append(f"x' = {after}{' + w' if plus else ''}")
         else:
+            after = [_sum([text, w], 0.0) for text, w in zip(after, plus, strict=True)] if plus else after
             self._say((f"{name}'", text) for name, text in zip(self.names.states, after, strict=True))
         if program.deviation >= 0:
             found = self.texts[program.deviation]
             self._say([("deviation", found if isinstance(found, str) else f"({', '.join(found)})")])
-        return self.out
+        return self.out[before:]
 
     def _say(self, pairs) -> None:
         self.out += [f"{name} = {text}" for name, text in pairs if name != text]
@@ -108,6 +129,8 @@ class _Writer:
         if kind in ("state", "disturbance"):
             names = list(self.names.states if kind == "state" else self.names.disturbances)
             return names if width <= _SMALL else self._vector(slot, f"({', '.join(names)})")
+        if kind == "numbers" and self.numbers:
+            return list(self.numbers) if width <= _SMALL else self._vector(slot, f"({', '.join(self.numbers)})")
         if kind == "numbers":
             return "ref" if width != 1 else ["ref"]
         operands = [self.texts[r] for r in instruction.reads]

@@ -59,6 +59,8 @@ def flow_of(control: Program, rate: Program, *, period: float, substeps: int, or
     require_smooth(rate)
     if control.reads_disturbance:
         raise ValueError("the control reads the disturbance, which nobody measures")
+    if rate.control >= 0 or rate.deviation >= 0 or control.deviation >= 0:
+        raise ValueError("the right-hand side of the ODE or the control has an output that neither has")
     if control.controls != rate.numbers or control.states != rate.states:
         raise ValueError(
             f"the control makes {control.controls} numbers of {control.states} states, the right-hand side of the ODE "

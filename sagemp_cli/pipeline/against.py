@@ -15,6 +15,7 @@ from sagemp_cli.checker.check import Report, sides
 from sagemp_cli.checker.claim import disturbance_names
 from sagemp_cli.checker.clearance import clearances, goal_margins
 from sagemp_cli.checker.document import Document
+from sagemp_cli.checker.lines import lines_of
 from sagemp_cli.checker.points import outputs_at
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.dynamics.base import Dynamics
@@ -113,12 +114,11 @@ def _scene(document: Document, wanted: SafeSet, safe_ones: Sequence[int]) -> Ite
     own = np.isin(tubes["cell_reference"], safe_ones)
     lower, upper = tubes["tube_lower"][own], tubes["tube_upper"][own]
     known = bool(len(lower)) and bool(np.isfinite(lower).all() and np.isfinite(upper).all())
-    place = list(document.position)
     apart: list[Any] = [None] * len(wanted.names)
     inside: list[Any] = [None] * lower.shape[2]
     if known:
-        places = (side[..., place] for side in (lower, upper))
-        apart = clearances(wanted, *places, between=document.between, parts=document.parts)
+        lines = [line for c in np.flatnonzero(own).tolist() for line in lines_of(document, c)]
+        apart = clearances(wanted, lines, document.parts)
         inside = goal_margins(wanted, lower[:, -1].min(axis=0), upper[:, -1].max(axis=0))
     if given.workspace != wanted.workspace:
         covers = wanted.workspace is None or (known and bool(apart[0] > 0))

@@ -9,6 +9,7 @@ import numpy as np
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.controller import Controller
 from sagemp_cli.problem import Problem
+from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.stored import to_record
 from sagemp_cli.storage import LoopRecord, ProgramRecord
@@ -34,6 +35,53 @@ def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
 def deviation_record(problem: Problem, tracker: Controller) -> ProgramRecord:
     """The step of a learned robot's analytical model by way of the network: w enlarged by what the two differ by."""
     return to_record(step_of(problem, tracker, compared=True)[0])
+
+
+def continuous_loop_record(
+    loop: SampledLoop,
+    *,
+    lookahead: int = 0,
+    state_names: Sequence[str] | None = None,
+    state_units: Sequence[str] | None = None,
+    control_names: Sequence[str] | None = None,
+    control_units: Sequence[str] | None = None,
+    position: Sequence[int] = (),
+) -> LoopRecord:
+    """A loop in continuous time: its control, its right-hand side and its period.
+
+    Args:
+        loop: it.
+        lookahead: states of the reference that the numbers of an instant are; 0 if there is no reference.
+        state_names, state_units, control_names, control_units: words; ``x0``, ``u0``, ... without units by default.
+        position: entries of the state that are the position in the scene, if there is one.
+
+    Raises:
+        UsageError: its numbers are not those of the reference, or the names are not one for each state or control.
+    """
+    n, m, g = loop.state_dim, loop.controls, loop.control.numbers
+    if g != lookahead * n:
+        raise UsageError(
+            f"the control has {g} numbers at every instant, {lookahead} states of a reference are {lookahead * n}"
+        )
+    return LoopRecord(
+        programs=(to_record(loop.control),),
+        step_program=np.zeros(loop.horizon, np.int64),
+        lookahead=lookahead,
+        state_names=_words(state_names, [f"x{i}" for i in range(n)], "states"),
+        state_units=_words(state_units, [""] * n, "units of states"),
+        control_names=_words(control_names, [f"u{i}" for i in range(m)], "controls"),
+        control_units=_words(control_units, [""] * m, "units of controls"),
+        position=np.array(list(position), np.int64),
+        dt=loop.period,
+        rate=to_record(loop.rate),
+    )
+
+
+def _words(given: Sequence[str] | None, default: Sequence[str], what: str) -> tuple[str, ...]:
+    words = tuple(default if given is None else given)
+    if len(words) != len(default):
+        raise UsageError(f"{len(default)} {what} need as many words, found {len(words)}")
+    return words
 
 
 def strangers_loop_record(

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.reachability.flow import Flow
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import PARTS, Between, Box, Tube
-from sagemp_cli.storage import Counterexample, Relaxations, Tubes
+from sagemp_cli.storage import Counterexample, FlowBounds, Relaxations, Tubes
 from sagemp_cli.verification.attack.falsifier import Counterexample as Found
 from sagemp_cli.verification.verdict import Outcome, Verdict
 from sagemp_cli.verification.verification import Verification
@@ -42,6 +43,22 @@ def tubes_record(v: Verification) -> Tubes:
         between=str(v.between),
         parts=1 if v.between is Between.SAMPLES else PARTS,
         relaxations=None if v.recording is None else relaxations_record(v.recording),
+    )
+
+
+def flow_record(flow: Flow) -> FlowBounds:
+    """What was proved within periods, as stored; the states at their beginning are those of the tube."""
+    return FlowBounds(
+        substeps=flow.division.substeps,
+        order=flow.division.order,
+        inner_lower=flow.state_lower[:, :, 1:].numpy(),
+        inner_upper=flow.state_upper[:, :, 1:].numpy(),
+        lower=flow.lower.numpy(),
+        upper=flow.upper.numpy(),
+        remainder_lower=flow.remainder_lower.numpy(),
+        remainder_upper=flow.remainder_upper.numpy(),
+        curve=flow.curve.numpy(),
+        drift=flow.drift.numpy(),
     )
 
 

@@ -114,7 +114,16 @@ class LoopRecord:
     control_names: tuple[str, ...] = texts("m", "names of the controls")
     control_units: tuple[str, ...] = texts("m", "their units")
     position: np.ndarray = array("p", "states that are the position in the scene", dtype="int64")
-    dt: float | None = scalar("time between two samples; said, not proved", units="s", optional=True)
+    dt: float | None = scalar(
+        "time between two samples; said, not proved, but in continuous time, where it is part of the claim",
+        units="s",
+        optional=True,
+    )
+    rate: ProgramRecord | None = group(
+        ProgramRecord,
+        "in continuous time x' - w, of the state and, as numbers, the control, which 'programs' is then",
+        optional=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +135,40 @@ class Relaxations:
     radius: np.ndarray = array("cells K entries", "greatest distance of the function from the line", finite=False)
     kept: np.ndarray | None = array(
         "cells K bytes", "which generators were kept after each step, one bit each", dtype="uint8", optional=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowBounds:
+    """What is proved of a loop in continuous time within its periods (see ``docs/continuous_time.md``)."""
+
+    substeps: int = scalar("equal parts that a period is cut into, S")
+    order: int = scalar("degree of the Taylor polynomials, p")
+    inner_lower: np.ndarray = array(
+        "cells K S-1 n", "lower bounds of the states where parts 2 to S of a period begin", finite=False
+    )
+    inner_upper: np.ndarray = array(
+        "cells K S-1 n", "upper bounds of the states where parts 2 to S of a period begin", finite=False
+    )
+    lower: np.ndarray = array(
+        "cells K S n", "lower corners of boxes that no solution leaves within a part", finite=False
+    )
+    upper: np.ndarray = array(
+        "cells K S n", "upper corners of boxes that no solution leaves within a part", finite=False
+    )
+    remainder_lower: np.ndarray = array(
+        "cells K S n", "lower bounds of what the polynomial of a part leaves out", finite=False
+    )
+    remainder_upper: np.ndarray = array(
+        "cells K S n", "upper bounds of what the polynomial of a part leaves out", finite=False
+    )
+    curve: np.ndarray = array(
+        "cells K S n",
+        "bounds of h^2 / 2 times the size of x'' under a constant disturbance, h the length of a part",
+        finite=False,
+    )
+    drift: np.ndarray = array(
+        "cells K S n", "how far a solution is from that under a mean of w, beside the integrals of both", finite=False
     )
 
 
@@ -164,9 +207,15 @@ class Tubes:
     seconds: np.ndarray = array("count", "share of the proof time", units="s")
     propagator: str = scalar("propagator that made the tubes")
     rigorous: bool = scalar("whether rounding is included in the tubes")
-    between: str = scalar("'segments': the safe set is kept over the whole of every step; 'samples': at samples only")
-    parts: int = scalar("parts of a step that were checked one by one; 1 with 'samples'")
+    between: str = scalar(
+        "'segments': the safe set is kept over the whole of every step; 'samples': at samples only; 'continuous': at "
+        "all times, by every solution of an ODE"
+    )
+    parts: int = scalar(
+        "parts of a step, or in continuous time of a part of a period, that were checked one by one; 1 with 'samples'"
+    )
     relaxations: Relaxations | None = group(Relaxations, "what the proof can be done again from", optional=True)
+    flow: FlowBounds | None = group(FlowBounds, "in continuous time, what is proved between the samples", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)

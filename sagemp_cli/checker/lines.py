@@ -1,0 +1,48 @@
+"""Where the position of a cell's states is between the samples, according to the stored bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sagemp_cli.checker.balls import ball, balls
+from sagemp_cli.checker.between import SAMPLES, Line, boxes_of
+from sagemp_cli.checker.document import Document
+
+
+def lines_of(document: Document, c: int) -> list[Line]:
+    """Lines of a cell over the position, from sample to sample or, in continuous time, from part to part of a period;
+    points, if nothing is claimed but of the samples.
+
+    Raises:
+        Unproved: a bound is not finite.
+    """
+    place, tubes, flow, ode = list(document.position), document.tubes, document.flow, document.ode
+
+    def over(side: str) -> np.ndarray:
+        tube = tubes[f"tube_{side}"][c]
+        if ode is None:
+            return tube[:, place]
+        rows = np.concatenate([tube[:-1, None], flow[f"inner_{side}"][c]], axis=1).reshape(-1, tube.shape[1])
+        return np.concatenate([rows, tube[-1:]])[:, place]
+
+    boxes = boxes_of(over("lower"), over("upper"))
+    if document.between == SAMPLES:
+        return [Line(box, box) for box in boxes]
+    ends = list(zip(boxes[:-1], boxes[1:], strict=True))
+    if ode is None:
+        return [Line(first, last) for first, last in ends]
+    lower, upper, curve, drift = (
+        [balls(row[place]) for row in flow[name][c].reshape(len(ends), -1)]
+        for name in ("lower", "upper", "curve", "drift")
+    )
+    w = zip(*(balls(tubes[f"disturbance_{side}"][place]) for side in ("lower", "upper")), strict=True)
+    swing = [ball(ode.length) * (b - a) for a, b in w]  # 2 h r_W
+    return [
+        Line(
+            *pair,
+            bend=[bend + more for bend, more in zip(curve[i], swing, strict=True)],
+            rest=[2 * e for e in drift[i]],
+            stay=(lower[i], upper[i]),
+        )
+        for i, pair in enumerate(ends)
+    ]

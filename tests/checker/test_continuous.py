@@ -1,0 +1,164 @@
+"""Certificates in continuous time: proved from the file alone, and no solution of the ODE leaves what is proved."""
+
+import numpy as np
+import pytest
+import torch
+
+from sagemp_cli.checker.check import check, recheck
+from sagemp_cli.checker.claim import claim_rows, equation_lines, said_rows
+from sagemp_cli.errors import ArtifactError
+
+from .conftest import constants_of
+from .continuous import FlowCase, flow_case
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> FlowCase:
+    return flow_case(tmp_path_factory.mktemp("flow") / "certificate.h5")
+
+
+@pytest.fixture(scope="module")
+def path(case, tmp_path_factory):
+    return case.write(tmp_path_factory.mktemp("flow") / "certificate.h5")
+
+
+@pytest.mark.parametrize(("substeps", "order"), [(1, 1), (1, 3), (4, 2)])
+def test_what_the_propagator_finds_is_proved_however_it_is_divided(substeps, order, tmp_path):
+    made = flow_case(tmp_path / "certificate.h5", substeps=substeps, order=order)
+    report = check(made.write(tmp_path / "certificate.h5"))
+    assert report.answer == "VERIFIED", (report.problems, report.findings)
+    assert 0.05 < report.findings[0].clearance["disc"] < 0.2
+
+
+def test_the_claim_is_about_all_times_and_says_the_ode(path):
+    report = check(path)
+    assert report.answer == "VERIFIED" and recheck(path) == ""
+    rows = claim_rows(report.document)
+    said = dict(rows)
+    assert "all measurable w(t) in W and all times t in [0, K dt] = [0, 0.8] s" in said["for"]
+    assert said["between"].startswith("continuous: the safe set is kept at all of these times")
+    ode = [text for label, text in rows if label == "ODE"]
+    assert ode[1:] == ["north' = sin(heading) + w_north", "heading' = 1.5 * u0 - 0.1 * heading + w_heading"]
+    assert "in 2 parts, Taylor polynomials of degree 2" in said["how it is proved"]
+    assert "held on [t_k, t_k + dt]" in said["control"]
+    assert "between samples" not in dict(said_rows(report.document))  # the period is proved, not said
+    assert equation_lines(report.document)[-1] == ode[-1]
+
+
+def test_workers_prove_the_same(path):
+    assert check(path, processes=2).answer == "VERIFIED"
+
+
+def test_no_switching_signal_leaves_what_is_proved_at_any_time(case):
+    """Solutions by a fine Runge-Kutta method, w switching at up to 16 times the rate of the parts."""
+    fine, slack, flow, tubes = 32, 1e-9, case.certificate.tubes.flow, case.certificate.tubes
+    rng, w, loop = np.random.default_rng(0), case.disturbance, case.loop
+    steps, per = loop.horizon * fine, fine // flow.substeps
+    for c in range(2):
+        low, high = case.cells.lower[c], case.cells.upper[c]
+        count = 400
+        x = low + torch.from_numpy(rng.uniform(size=(count, 3)).round()) * (high - low)
+        every = rng.choice([steps, fine, per, per // 2, 4, 2, 1], count)
+        signal = np.stack([np.repeat(rng.uniform(size=(steps, 3)).round(), e, axis=0)[:steps] for e in every])
+        signal = w.lower + torch.from_numpy(signal) * (w.upper - w.lower)
+        states, h, u = [x], loop.period / fine, x[:, :1]
+        for i in range(steps):
+            u = loop.control_given(None, x) if i % fine == 0 else u
+
+            def rate(x, u=u, v=signal[:, i]):
+                return loop.rate(x, u) + v
+
+            a = rate(x)
+            b = rate(x + h / 2 * a)
+            d = rate(x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * d + rate(x + h * d))
+            states.append(x)
+        states = torch.stack(states, 1).numpy()
+        at = states[:, ::fine]
+        assert ((tubes.tube_lower[c] - slack <= at) & (at <= tubes.tube_upper[c] + slack)).all()
+        pieces = states[:, :-1].reshape(count, loop.horizon, flow.substeps, per, 3)
+        assert (flow.lower[c][:, :, None] - slack <= pieces).all() and (
+            pieces <= flow.upper[c][:, :, None] + slack
+        ).all()
+        begin = pieces[:, :, 1:, 0]
+        assert (flow.inner_lower[c] - slack <= begin).all() and (begin <= flow.inner_upper[c] + slack).all()
+        s = np.arange(per)[:, None] / per
+        ends = states[:, ::per]
+        first, last = (
+            side.reshape(count, loop.horizon, flow.substeps, 1, 3) for side in (ends[:, :-1], ends[:, 1:])
+        )  # fmt: skip
+        swing = loop.period / flow.substeps * (w.upper - w.lower).numpy()
+        bulge = s * (1 - s) * (flow.curve[c][:, :, None] + swing) + 2 * flow.drift[c][:, :, None]
+        assert (np.abs(pieces - first - s * (last - first)) <= bulge + slack).all()
+
+
+def put(name, index, value):
+    def change(file):
+        data = file[f"data/tubes/flow/{name}"]
+        data[index] = value(data[index])
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (put("upper", (1, 2, 0, 1), lambda v: v - 0.02), "cell 1, step 2: part 0: the flow of state 1"),
+        (put("remainder_upper", (0, 1, 1, 2), lambda v: v * 0.5), "cell 0, step 1: part 1: the remainder of state 2"),
+        (put("curve", (0, 0, 0, 0), lambda v: v * 0.5), "cell 0, step 0: part 0: the path of state 0 may bend more"),
+        (put("drift", (1, 3, 1, 0), lambda v: v * 0.5), "cell 1, step 3: part 1: state 0 may drift farther"),
+        (put("inner_upper", (0, 3, 0, 1), lambda v: v - 0.02), "cell 0, step 3: part 1: state 1 is only proved"),
+        (put("drift", (1, 3, 1, 0), lambda v: np.nan), "finite"),
+        (put("upper", (1, 3, 1, 0), lambda v: np.inf), "finite"),
+    ],
+)
+def test_what_is_not_so_between_the_instants_is_named_with_its_part(change, message, path, mutate, tmp_path):
+    report = check(mutate(path, tmp_path / "mutant.h5", change))
+    assert report.answer == "UNKNOWN" and message in report.findings[0].reason
+
+
+def attribute(where, **values):
+    return lambda file: file[where].attrs.update(values)
+
+
+def without(name):
+    return lambda file: file.__delitem__(name)
+
+
+RATE = "data/loop/rate"
+
+
+def kinked(file):
+    kinds = file[f"{RATE}/kinds"]
+    kinds[kinds.asstr()[()].tolist().index("sin")] = "relu"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (attribute("data/tubes", between="segments"), "needs 'between: continuous'"),
+        (without("data/tubes/flow"), "needs 'between: continuous'"),
+        (without(RATE), "needs 'between: continuous'"),
+        (attribute("data/tubes/flow", substeps=4), "must be float64 of shape"),
+        (attribute("data/tubes/flow", order=0), "the order is 0"),
+        (attribute("data/loop", dt=0.0), "the period is 0"),
+        (lambda file: file["data/loop"].attrs.__delitem__("dt"), "needs dt"),
+        (kinked, "'relu' stands in the right-hand side of the ODE"),
+        (lambda file: file["data/tubes/flow"].create_dataset("more", data=[1.0]), "holds 'more'"),
+    ],
+)
+def test_a_file_that_is_half_in_continuous_time_is_refused(change, message, path, mutate, tmp_path):
+    with pytest.raises(ArtifactError, match=message):
+        check(mutate(path, tmp_path / "mutant.h5", change))
+
+
+def test_another_right_hand_side_is_another_claim_or_none(path, mutate, tmp_path):
+    """A constant of the rate is part of the ODE: what is proved of one is not printed of another."""
+
+    def faster(file):
+        constant = next(i for i, k in enumerate(file[f"{RATE}/kinds"].asstr()[()]) if k == "constant")
+        numbers = file[f"{RATE}/numbers"]
+        numbers[constants_of(file, constant, RATE)] = numbers[constants_of(file, constant, RATE)] * 1.001
+
+    report = check(mutate(path, tmp_path / "mutant.h5", faster))
+    assert claim_rows(report.document) != claim_rows(check(path).document)
