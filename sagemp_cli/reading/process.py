@@ -36,13 +36,18 @@ def main() -> None:
         wire.send(answers, answer(request))
 
 
-def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """What is in a file, or ``{"refused": why}``; see :mod:`sagemp_cli.reading.reader` for the requests."""
+def answer(request: dict[str, Any], tries: int = 5) -> dict[str, Any]:
+    """What is in a file, or ``{"refused": why}``; see :mod:`sagemp_cli.reading.reader` for the requests.
+
+    A file that another run replaced meanwhile is read again, up to ``tries`` times in all.
+    """
     try:
         with open_regular(request["path"]) as file:
             size = os.fstat(file.fileno()).st_size
             _limit(size)
             return _read(request, file, Budget(size))
+    except _ReplacedError as e:
+        return answer(request, tries - 1) if tries > 1 else {"refused": str(e)}
     except RefusedError as e:
         return {"refused": str(e)}
     except MemoryError:
@@ -84,6 +89,10 @@ def _read(request: dict[str, Any], file: BufferedReader, budget: Budget) -> dict
                 return {"sha256": sha256, "tree": tree_of(opened, budget, without=request["without"])}
 
 
+class _ReplacedError(RefusedError):
+    """The name stands for another file now."""
+
+
 class _hdf5:
     """The same file opened by the HDF5 library, which only takes names; one that was replaced meanwhile is refused."""
 
@@ -99,7 +108,7 @@ class _hdf5:
         now = os.stat(self._path)
         same = [(s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns) for s in (self._before, now)]
         if kind is None and same[0] != same[1]:
-            raise RefusedError("was replaced while it was read; try again")
+            raise _ReplacedError("was replaced while it was read; try again")
 
 
 def _limit(size: int) -> None:

@@ -202,3 +202,26 @@ def test_npz_that_is_none_unpacks_too_far_or_has_a_giant_header_is_one_line(tmp_
         with pytest.raises(ArtifactError, match=f"a.npz: .*({message})") as error:
             read_arrays(path)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("times", [1, 99])
+def test_a_file_that_is_replaced_while_it_is_read_is_read_again(hdf5, monkeypatch, times):
+    with np.errstate():  # the module is one for a process of its own
+        from sagemp_cli.reading import process
+    path = hdf5(lambda file: file.update(a=0.0))
+    new = [hdf5(lambda file, i=i: file.update(a=float(i)), f"{i}.h5") for i in range(1, min(times, 9) + 1)]
+    read = process.tree_of
+
+    def meanwhile(*args, **options):
+        tree = read(*args, **options)
+        if new:
+            os.replace(new.pop(0), path)
+        return tree
+
+    monkeypatch.setattr(process, "tree_of", meanwhile)
+    monkeypatch.setattr(process, "_limit", lambda size: None)
+    found = process.answer({"path": str(path), "format": "tree", "without": [], "hash": True, "damaged": ""})
+    if times == 1:
+        assert found["tree"]["a"][()] == 1.0 and found["sha256"] == sha256_of(path)
+    else:
+        assert found == {"refused": "was replaced while it was read; try again"}

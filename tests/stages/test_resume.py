@@ -110,6 +110,33 @@ def test_two_runs_at_once_of_the_same_work_both_end_well(work):
     assert not work().partial_folder("gen-data").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("inner_ends", [True, False])
+def test_two_trainings_at_once_share_their_checkpoint_and_both_end_well(work, inner_ends):
+    """One ends, or is interrupted, while the other trains: what it leaves, or takes away, is of no harm to that."""
+    stage, needs, seen = stage_named("train-tracker"), ("gen-data", "train-planner"), []
+
+    def started(progress):
+        return stage.run(work(*needs, overrides=SHORT, overwrite=True, progress=progress))
+
+    class Meanwhile(Interrupt):
+        def advance(self, steps=1, note=""):
+            super().advance(steps, note)
+            if not seen and self.advanced >= 5:
+                seen.append("inner")
+                if inner_ends:
+                    seen.append(read_artifact(started(Interrupt()), TrackerModel).record)
+                else:
+                    with pytest.raises(KeyboardInterrupt):
+                        started(Interrupt(after=7))
+                    assert list(work(*needs).partial_folder("train-tracker").rglob("*.h5"))
+
+    path = started(Meanwhile())
+    assert path.with_suffix(".png").exists() and not work().partial_folder("train-tracker").exists()
+    if inner_ends:
+        assert_same(read_artifact(path, TrackerModel).record, seen[1])
+
+
 def test_a_run_of_another_config_leaves_the_pieces_of_one_that_is_running(work):
     stage = stage_named("gen-data")
 
