@@ -46,7 +46,7 @@ class BoundedRenderer(RendererAgg):
     def _update_methods(self) -> None:
         super()._update_methods()
         self._draw_collection = self.draw_path_collection  # Agg's own, which is no method of the class
-        self.draw_path_collection = self._near_collection
+        self.draw_path_collection = self._near_collection  # pyright: ignore[reportAttributeAccessIssue]  (other names)
 
     def _near_collection(
         self,
