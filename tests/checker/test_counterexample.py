@@ -4,7 +4,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from sagemp_cli.checker.counterexample import replay
+from sagemp_cli.checker.balls import balls
+from sagemp_cli.checker.counterexample import _moved, replay
 
 from .by_hand import line, program
 
@@ -25,3 +26,9 @@ def test_a_replay_holds_the_rollout_of_exact_numbers():
         if k < 3:
             w = Fraction(disturbances[k][0])
             exact = [Fraction(1 / 3) * exact[0] + w, Fraction(1 / 3) * exact[1] - w]
+
+
+def test_what_lies_outside_of_a_set_is_moved_to_its_nearest_point_and_what_lies_inside_stays():
+    box = list(zip(balls([-1.0, 0.5]), balls([1.0, 0.5]), strict=True))
+    for point, nearest in [((0.25, 0.5), (0.25, 0.5)), ((-1.5, 0.4), (-1.0, 0.5)), ((7.0, 0.6), (1.0, 0.5))]:
+        assert [float(v) for v in _moved(np.array(point), box)] == list(nearest)

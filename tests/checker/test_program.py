@@ -103,3 +103,13 @@ def test_every_kind_of_the_specification_is_known():
     text = (Path(__file__).parents[2] / "docs" / "program.md").read_text().split("## Instructions")[1].split("## ")[0]
     named = {w.strip("` ") for row in text.splitlines() if row.startswith("| `") for w in row.split("|")[1].split(",")}
     assert named == set(KINDS)
+
+
+def test_a_step_with_its_deviation_added_to_w_is_told_from_others_by_its_control_too():
+    lines = [line("neg", 0), line("identity", 2), line("add", 1, 3), line("add", 0, 4)]
+    deviating = program(*lines, d=2, next=5, control=0, deviation=2)
+    same = [line("neg", 0), line("add", 0, 1)]
+    assert deviating.is_deviating(program(*same, d=2, next=3, control=0))
+    assert not deviating.is_deviating(program(*same, d=2, next=3, control=2))
+    assert not deviating.is_deviating(program(*same, d=2, next=3))
+    assert not deviating.is_deviating(program(*same, d=2, next=2, control=0))

@@ -320,6 +320,10 @@ def test_a_small_file_that_asks_for_giant_numbers_is_refused_at_once(saved):
     began = time.monotonic()
     with pytest.raises(ArtifactError, match="unpacks into far more"):
         read_network(path)
+    both = [node("Conv", ["x", "w"], ["h"]), node("Conv", ["h", "w"], ["y"])]
+    path = saved(both, {"w": np.ones((1, 1, 1), np.float32)}, shape=[1, 1, 3000], outputs=None)
+    with pytest.raises(ArtifactError, match="net.onnx: has more than 16777216 numbers, far more than can be bounded"):
+        read_network(path)
     conv = [node("Conv", ["x", "w"], ["y"])]
     path = saved(conv, {"w": np.ones((1, 1, 1), np.float32)}, shape=[1, 1, 10**6], outputs=None)
     with pytest.raises(ArtifactError, match="far more than can be bounded"):

@@ -14,9 +14,11 @@ from torch import nn
 from torch.nn import functional
 
 from sagemp_cli.errors import UnsupportedOperationError
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.affine.compiled.operations import Frame, Value
 from sagemp_cli.reachability.affine.compiled.run import Steps
 from sagemp_cli.reachability.program.loops import RecordedLoop, record
+from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.zonotope import Zonotope
 
@@ -383,3 +385,16 @@ def test_an_operation_has_the_relaxations_of_the_specification(names):
 def test_what_is_of_second_order_is_added_to_the_radius_of_a_band(function):
     (relaxed,) = Formed(function, [1.0, 2.0], DIAGONAL).frame.relaxed
     assert bool((torch.as_tensor(relaxed.radius) >= torch.as_tensor(relaxed.band.radius) * (1 + 0.999e-9)).all())
+
+
+@pytest.mark.parametrize("kind", ["maximum", "minimum"])
+@pytest.mark.parametrize("order", [(0, 2), (2, 0)])
+def test_a_stored_limit_by_a_number_is_a_clamp(kind, order):
+    limit = (torch.tensor([0.2, -0.1], dtype=torch.float64),)
+    inputs = Instruction("state", 2), Instruction("disturbance", 1), Instruction("constant", 2, (), limit)
+    loop = RecordedLoop((Program((*inputs, Instruction(kind, 2, order)), Outputs(3)),), torch.zeros(1, 0).double(), 1)
+    start, w = Box.around([0.0, 0.0], [0.5, 0.5]), Box.around([0.0], [0.0])
+    run = Affine().run(loop, start, w, keep_steps=True)
+    assert [relaxed.name for relaxed in run.steps[0].relaxed] == ["clamp"]
+    ends = [getattr(torch, kind)(side, limit[0]) for side in (start.lower, start.upper)]
+    assert bool((run.tube.lower[1] <= ends[0]).all()) and bool((ends[1] <= run.tube.upper[1]).all())

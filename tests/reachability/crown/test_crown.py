@@ -11,8 +11,9 @@ from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.crown import backward_steps
+from sagemp_cli.reachability.crown import crown as crown_module
 from sagemp_cli.reachability.crown import steps as steps_module
-from sagemp_cli.reachability.crown.backward import _swept, _tilt
+from sagemp_cli.reachability.crown.backward import _swept, _tilt, backward
 from sagemp_cli.reachability.crown.backward_steps import Product, Step
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
@@ -155,6 +156,22 @@ def test_chunks_of_rows_change_nothing():
     loop = unicycle_loop(line(0.3))
     whole, chunks = (Crown(rows=rows).propagate(loop, START, DISTURBANCE) for rows in (8192, 17))
     torch.testing.assert_close(whole.lower, chunks.lower, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("rows", "sweeps"), [(1, 10), (8, 10), (24, 4), (80, 1), (8192, 1)])
+def test_as_many_steps_go_back_in_one_sweep_as_the_rows_allow(rows, sweeps, monkeypatch):
+    """Ten steps of four states, whose bounds are two rows each."""
+    known = []
+
+    def counted(*arguments, **options):
+        known.append(options["targets"])
+        return backward(*arguments, **options)
+
+    monkeypatch.setattr(crown_module, "backward", counted)
+    loop = unicycle_loop(line(0.3))
+    loop = ClosedLoop(loop.dynamics, loop.tracker, loop.references[:11])
+    Crown(rows=rows).propagate(loop, START, DISTURBANCE)
+    assert len(known) == sweeps and [k for targets in known for k in targets] == list(range(10))
 
 
 def test_wrong_options_are_refused_in_one_line():
