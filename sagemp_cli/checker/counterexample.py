@@ -70,6 +70,8 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
             raise Unproved("its disturbances are not in W")
         if not 0 <= step <= last:
             raise Unproved(f"its step {step} is none of the horizon {last}")
+        if document.ode is not None and (step or fraction):
+            raise Unproved("it is a solution of an ODE, which is not followed here")
         if not (fraction == 0 or (0 < fraction < 1 and step < last and document.between == SEGMENTS)):
             raise Unproved(f"its time, {fraction:.6g} of step {step} over, is none that the claim speaks of")
         with ctx.workprec(BITS):

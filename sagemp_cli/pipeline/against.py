@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from sagemp_cli.checker.balls import BITS, ball, ctx
-from sagemp_cli.checker.between import SEGMENTS
+from sagemp_cli.checker.between import CONTINUOUS, SEGMENTS
 from sagemp_cli.checker.check import Report, sides
 from sagemp_cli.checker.claim import disturbance_names
 from sagemp_cli.checker.clearance import clearances, goal_margins
 from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.lines import lines_of
 from sagemp_cli.checker.points import outputs_at
+from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.dynamics.learned import Learned
@@ -64,8 +65,9 @@ def differences(report: Report, config: Mapping[str, Any]) -> list[Difference]:
         wanted = SetOfConfig.of("start", config["start"], n), SetOfConfig.of("disturbance", config["disturbance"], n)
         found += _boxes("X_I", document, document.sets[0], wanted[0], safe_ones)
         found += _boxes("W", document, document.sets[1], wanted[1], safe_ones)
-        if document.between != SEGMENTS:
-            found.append(Difference("between", document.between, SEGMENTS, covers=False))
+        asked = CONTINUOUS if robot.continuous else SEGMENTS
+        if document.between != asked:
+            found.append(Difference("between", document.between, asked, covers=False))
         if config["horizon"] != document.horizon:
             found.append(Difference("K", str(document.horizon), str(config["horizon"]), covers=False))
         found += _scene(document, SafeSet.of(config["scene"]), safe_ones)
@@ -139,11 +141,17 @@ def _scene(document: Document, wanted: SafeSet, safe_ones: Sequence[int]) -> Ite
 def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
     """The program's step beside the robot's formulas, at points of the tube."""
     if document.dt is not None and document.dt != robot.dt:
-        yield Difference("between samples", f"{document.dt:.6g} s (said)", f"{robot.dt:.6g} s", covers=False)
+        how = "said" if document.ode is None else "proved"
+        yield Difference("between samples", f"{document.dt:.6g} s ({how})", f"{robot.dt:.6g} s", covers=False)
+    if (document.ode is not None) != robot.continuous:  # said already: another kind of time
+        return
     model: Dynamics = robot.analytical
     true = document.true_model
     if isinstance(robot, Learned) and true is None:
         yield Difference("step", "the network in the file", "a network learned from the formulas", covers=True)
+        return
+    if document.ode is not None:
+        yield from _rate(document, document.ode.rate, model)
         return
     program = (document if true is None else true).programs[0]
     if program.control < 0 or len(document.programs) > 1 or program.disturbances != robot.state_dim:
@@ -166,11 +174,42 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
             out = outputs_at(program, {name: [ball(v) for v in values] for name, values in inputs.items()})
             after, u = (np.array([float(v) for v in out[name]]) for name in ("next", "control"))
             exact = model.step(*map(torch.from_numpy, (x, u, w))).detach().numpy()
-            worst = max(worst, float(np.nanmax(np.abs(after - exact) / (1.0 + np.abs(exact)))))
+            worst = max(worst, _apart(after, exact))
     if not worst <= _TOLERANCE:
-        yield Difference(
-            "step", f"another one, by up to {worst:.3g} at {_POINTS} points", "the robot's formulas", False
-        )
+        yield _another("step", worst)
+
+
+def _rate(document: Document, rate: Program, model: Dynamics) -> Iterator[Difference]:
+    """The right-hand side of an ODE beside the robot's formulas, likewise."""
+    if rate.numbers != model.control_dim:
+        yield Difference("ODE", f"of {rate.numbers} controls", f"of {model.control_dim}", covers=False)
+        return
+    worst, rng, tubes = 0.0, np.random.default_rng(0), document.tubes
+    boxes = [(tubes[f"{name}_lower"], tubes[f"{name}_upper"]) for name in ("tube", "control")]
+    with ctx.workprec(BITS):
+        for _ in range(_POINTS):
+            k, c = int(rng.integers(document.horizon)), int(rng.integers(len(tubes["tube_lower"])))
+            rows = c, int(tubes["cell_reference"][c])
+            x, u = (
+                rng.uniform(*(np.nan_to_num(side[row, k], posinf=1e3, neginf=-1e3) for side in sides))
+                for row, sides in zip(rows, boxes, strict=True)
+            )
+            inputs = {"state": x, "disturbance": np.zeros(len(x)), "numbers": u}
+            out = outputs_at(rate, {name: [ball(v) for v in values] for name, values in inputs.items()})
+            found = np.array([float(v) for v in out["next"]])
+            worst = max(worst, _apart(found, model.derivative(*map(torch.from_numpy, (x, u))).detach().numpy()))
+    if not worst <= _TOLERANCE:
+        yield _another("ODE", worst)
+
+
+def _apart(found: np.ndarray, exact: np.ndarray) -> float:
+    """The largest relative difference; what is a number in one of them only is infinitely far."""
+    both = np.isnan(found) & np.isnan(exact)
+    return float(np.max(np.nan_to_num(np.where(both, 0.0, np.abs(found - exact) / (1.0 + np.abs(exact))), nan=np.inf)))
+
+
+def _another(what: str, worst: float) -> Difference:
+    return Difference(what, f"another one, by up to {worst:.3g} at {_POINTS} points", "the robot's formulas", False)
 
 
 def _limits(document: Document, robot: Dynamics, safe_ones: Sequence[int]) -> Iterator[Difference]:

@@ -13,12 +13,22 @@ from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.stored import to_record
 from sagemp_cli.storage import LoopRecord, ProgramRecord
-from sagemp_cli.verification.cells import step_of
+from sagemp_cli.verification.cells import sampled_of, step_of
 
 
 def loop_record(problem: Problem, tracker: Controller) -> LoopRecord:
     """The loop of a problem under a tracker; the same whatever the references."""
     dynamics = problem.dynamics
+    if dynamics.continuous:
+        return continuous_loop_record(
+            sampled_of(problem, tracker),
+            lookahead=tracker.lookahead,
+            state_names=dynamics.state_names,
+            state_units=dynamics.state_units,
+            control_names=dynamics.control_names,
+            control_units=dynamics.control_units,
+            position=dynamics.position,
+        )
     return LoopRecord(
         programs=tuple(map(to_record, step_of(problem, tracker))),
         step_program=np.zeros(problem.horizon, np.int64),

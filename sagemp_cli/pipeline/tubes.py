@@ -43,6 +43,7 @@ def tubes_record(v: Verification) -> Tubes:
         between=str(v.between),
         parts=1 if v.between is Between.SAMPLES else PARTS,
         relaxations=None if v.recording is None else relaxations_record(v.recording),
+        flow=None if v.flow is None else flow_record(v.flow),
     )
 
 

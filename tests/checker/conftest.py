@@ -18,7 +18,7 @@ from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.scenes.scene import scene_from_mapping
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Between, Box
 from sagemp_cli.storage import Certificate, Header, Tubes, write_artifact
 from sagemp_cli.storage.content import HASH_ATTRIBUTE, content_hash
 from sagemp_cli.verification.cells import CellProver
@@ -70,6 +70,7 @@ def problem_from(config: dict[str, Any]) -> Problem:
         Box.around(config["start"]["center"], config["start"]["radius"]),
         Box.around([0.0] * n, config["disturbance"]["radius"]),
         config["horizon"],
+        between=Between.CONTINUOUS if dynamics.continuous else Between.SEGMENTS,
     )
 
 
@@ -105,12 +106,14 @@ def make_case(
     side=0.0,
     disc=None,
     limit=None,
+    time="discrete",
     **changes,
 ) -> Case:
     """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc;
     ``limit`` is where the controls saturate.
     """
     config = config_of(robot, **changes)
+    config["dynamics"]["time"] = time
     if disc is not None:
         config["scene"]["obstacles"][0]["center"] = disc
     problem = problem_from(config)

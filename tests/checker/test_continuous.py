@@ -1,14 +1,19 @@
 """Certificates in continuous time: proved from the file alone, and no solution of the ODE leaves what is proved."""
 
+import copy
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from sagemp_cli.checker.check import check, recheck
 from sagemp_cli.checker.claim import claim_rows, equation_lines, said_rows
+from sagemp_cli.checker.document import read_document
 from sagemp_cli.errors import ArtifactError
+from sagemp_cli.pipeline.against import differences
 
-from .conftest import constants_of
+from .conftest import constants_of, make_case
 from .continuous import FlowCase, flow_case
 
 
@@ -43,6 +48,52 @@ def test_the_claim_is_about_all_times_and_says_the_ode(path):
     assert "held on [t_k, t_k + dt]" in said["control"]
     assert "between samples" not in dict(said_rows(report.document))  # the period is proved, not said
     assert equation_lines(report.document)[-1] == ode[-1]
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory):
+    """A unicycle on a reference, as verify proves it, and its report."""
+    found = make_case(time="continuous")
+    return found, check(found.write(tmp_path_factory.mktemp("robot") / "certificate.h5"))
+
+
+def test_a_robot_under_a_tracker_is_proved_as_an_ode(robots):
+    _, report = robots
+    assert report.answer == "VERIFIED", (report.problems, report.findings)
+    rows = claim_rows(report.document)
+    assert [text for label, text in rows if label == "ODE"][0] == "px' = v * cos(theta) + w_px"
+    assert "reference 0" in dict(rows) and "8 periods of dt = 0.1 s" in dict(rows)["for"]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda c: None, []),
+        (lambda c: c["dynamics"].update(time="discrete"), ["between"]),
+        (lambda c: c["dynamics"].update(dt=0.05), ["between samples"]),
+        (lambda c: c["scene"]["obstacles"][0].update(radius=0.6), ["obstacle disc"]),
+    ],
+)
+def test_what_is_proved_of_an_ode_is_held_against_a_config(change, what, robots):
+    made, report = robots
+    config = copy.deepcopy(made.config)
+    change(config)
+    found = differences(report, config)
+    assert [d.what for d in found] == what
+    assert all(d.covers == (d.what == "obstacle disc") for d in found)
+
+
+def test_another_ode_is_found_at_points(robots, mutate, tmp_path):
+    made, report = robots
+
+    def turned(file):
+        kinds = file[f"{RATE}/kinds"]
+        sine, cosine = (kinds.asstr()[()].tolist().index(kind) for kind in ("sin", "cos"))
+        kinds[sine], kinds[cosine] = "cos", "sin"
+
+    document = read_document(mutate(report.path, tmp_path / "mutant.h5", turned))
+    (found,) = differences(dataclasses.replace(report, document=document), made.config)
+    assert found.what == "ODE" and not found.covers and "at 64 points" in found.proved
 
 
 def test_workers_prove_the_same(path):
