@@ -20,7 +20,7 @@ def claim(**changes):
     nothing = np.zeros((2, 0))
     made = CellClaim(
         np.zeros(2, np.int64), nothing, np.array([-1.0]), np.array([1.0]), -sides, sides, -sides[:2], sides[:2],
-        np.zeros(1), np.zeros(1), nothing, nothing, nothing, None, None,
+        np.zeros((2, 1)), np.zeros((2, 1)), nothing, nothing, nothing, None, None,
     )  # fmt: skip
     return dataclasses.replace(made, **changes)
 

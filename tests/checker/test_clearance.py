@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sagemp_cli.checker.balls import Unproved
-from sagemp_cli.checker.between import SAMPLES
+from sagemp_cli.checker.between import Line, boxes_of
 from sagemp_cli.checker.clearance import clearances, goal_margins
 from sagemp_cli.checker.scene import SafeSet
 
@@ -20,7 +20,8 @@ SCENE = {"workspace": {"lower": [-INF] * 2, "upper": [INF] * 2}, "obstacles": []
 
 def found(scene):
     safe = SafeSet.of(SCENE | scene)
-    return [float(d) for d in clearances(safe, LOWER, UPPER, between=SAMPLES, parts=1)]
+    boxes = [box for low, high in zip(LOWER, UPPER, strict=True) for box in boxes_of(low, high)]
+    return [float(d) for d in clearances(safe, [Line(box, box) for box in boxes], 1)]
 
 
 @pytest.mark.parametrize("axis", [0, 1])
