@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 SLOW = """
-    checker/test_mutants checker/test_program_mutants cli/test_check cli/test_end_to_end
+    checker/test_flow_mutants checker/test_mutants checker/test_program_mutants cli/test_check cli/test_end_to_end
     cli/test_every_experiment cli/test_init cli/test_own_stage cli/test_pipeline_commands cli/test_safety_rates
     experts/test_parallel planners/test_generative planners/test_planner_training report/test_figures
     report/test_safety stages/test_own_trackers stages/test_pipeline stages/test_reference_file

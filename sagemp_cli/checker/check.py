@@ -97,8 +97,14 @@ def check(path: Path, *, processes: int = 1, progress: Progress | None = None) -
     Raises:
         ArtifactError: the file is missing, damaged, changed, of a newer format or not one that can be checked.
     """
+    return check_document(read_document(path), path, processes=processes, progress=progress)
+
+
+def check_document(
+    document: Document, path: Path, *, processes: int = 1, progress: Progress | None = None
+) -> Report:  # fmt: skip
+    """The same of what was read from a file already."""
     began = time.perf_counter()
-    document = read_document(path)
     safe, sets = document.safe, document.sets
     tubes, true = document.tubes, None
     work = processes, progress or Silent()
@@ -249,6 +255,8 @@ def _geometry(
                 raise Unproved("its cells do not cover X_I")
             if not (np.isfinite(lower) & np.isfinite(upper) & (lower <= upper)).all():
                 raise Unproved("its tube is not finite")
+            if not all(np.isfinite(side[own]).all() for side in document.flow.values()):
+                raise Unproved("what is said between its instants is not finite")
             if tubes["step"][r] != -1 or tubes["fraction"][r] != 0 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
             lines = [line for c in np.flatnonzero(own).tolist() for line in lines_of(document, c)]

@@ -77,7 +77,7 @@ def _times(document: Document) -> str:
         return f"all starts in X_I and all w_k in W, k = 0, ..., K - 1; K = {steps} steps"
     return (
         f"all starts x(0) in X_I, all measurable w(t) in W and all times t in [0, K dt] = [0, {steps * dt:.6g}] s, "
-        f"K = {steps} periods of dt = {dt:.6g} s"
+        f"K = {steps} periods of dt = {dt!r} s"
     )
 
 

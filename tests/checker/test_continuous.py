@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.checker.balls import BITS, ctx
 from sagemp_cli.checker.check import check, recheck
 from sagemp_cli.checker.claim import claim_rows, equation_lines, said_rows
 from sagemp_cli.checker.document import read_document
+from sagemp_cli.checker.loop import Folded, Loop
+from sagemp_cli.checker.step import Entry, Step
+from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.against import differences
 
@@ -141,6 +145,63 @@ def test_no_switching_signal_leaves_what_is_proved_at_any_time(case):
         swing = loop.period / flow.substeps * (w.upper - w.lower).numpy()
         bulge = s * (1 - s) * (flow.curve[c][:, :, None] + swing) + 2 * flow.drift[c][:, :, None]
         assert (np.abs(pieces - first - s * (last - first)) <= bulge + slack).all()
+
+
+def own_sets(document, c):
+    """The checker's own boxes of a cell: at the instants ``(K+1, 2, n)``, and of controls and inner states."""
+    tubes, found, flow = document.tubes, document.relaxations, document.flow
+    with ctx.workprec(BITS):
+        rest = [np.broadcast_to(tubes[f"disturbance_{s}"], flow["lower"][c].shape) for s in ("lower", "upper")]
+        sides = [
+            np.concatenate([w, w, flow[f"remainder_{s}"][c]], -1).reshape(document.horizon, -1)
+            for w, s in zip(rest, ("lower", "upper"), strict=True)
+        ]
+        loop = Loop(Folded.of(document.ode.step), document.windows(0), *sides)
+        states, at, inner = Zonotope.box(tubes["cell_lower"][c], tubes["cell_upper"][c]), [], []
+        for k in range(document.horizon):
+            at.append(states.bounds())
+            columns = (found[name][c, k].tolist() for name in ("slope", "offset", "radius"))
+            step = Step(loop, k, states, [Entry(*entry) for entry in zip(*columns, strict=True)])
+            after, watched, _ = step.run()
+            inner.append(step.bounds(watched))
+            states = step.image(after)
+            if "kept" in found:
+                bits = np.unpackbits(found["kept"][c, k], bitorder="little")[: states.generators.shape[1]]
+                states = states.reduced(bits.astype(bool))
+        at.append(states.bounds())
+        return [np.array([[[float(end) for end in side] for side in row] for row in rows]) for rows in (at, inner)]
+
+
+def test_no_switching_signal_leaves_the_checkers_own_sets(case, path):
+    """Those are what it proves with; the stored ones have to contain them."""
+    document, fine, slack = read_document(path), 32, 1e-9
+    rng, w, loop = np.random.default_rng(5), case.disturbance, case.loop
+    steps, per, m = loop.horizon * fine, fine // case.certificate.tubes.flow.substeps, 1
+    for c in range(2):
+        at, inner = own_sets(document, c)
+        low, high = case.cells.lower[c], case.cells.upper[c]
+        x = low + torch.from_numpy(rng.uniform(size=(600, 3)).round()) * (high - low)
+        every = rng.choice([steps, fine, per, 4, 1], 600)
+        signal = np.stack([np.repeat(rng.uniform(size=(steps, 3)).round(), e, axis=0)[:steps] for e in every])
+        signal, h = w.lower + torch.from_numpy(signal) * (w.upper - w.lower), loop.period / fine
+        for i in range(steps):
+            k, inside = divmod(i, fine)
+            if inside == 0:
+                u = loop.control_given(None, x)
+                assert (at[k][:, 0] - slack <= x.numpy()).all() and (x.numpy() <= at[k][:, 1] + slack).all()
+                assert (inner[k][:m, 0] - slack <= u.numpy()).all() and (u.numpy() <= inner[k][:m, 1] + slack).all()
+            elif inside == per:
+                box = inner[k][m:]
+                assert (box[:, 0] - slack <= x.numpy()).all() and (x.numpy() <= box[:, 1] + slack).all()
+
+            def rate(x, u=u, v=signal[:, i]):
+                return loop.rate(x, u) + v
+
+            a = rate(x)
+            b = rate(x + h / 2 * a)
+            d = rate(x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * d + rate(x + h * d))
+        assert (at[-1][:, 0] - slack <= x.numpy()).all() and (x.numpy() <= at[-1][:, 1] + slack).all()
 
 
 def put(name, index, value):
