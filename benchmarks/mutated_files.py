@@ -103,8 +103,11 @@ def main() -> None:
     os.chdir(folder)
     shutil.rmtree("artifacts", ignore_errors=True)
     shutil.copytree("right", "artifacts")
-    right = (asked for target in READERS if target not in FILES for asked in READERS[target])
-    preload(configs(), [[p.format(file=f"{HERE}/certificate.h5") for p in asked] for asked in right])
+    quick = [
+        asked for target in READERS if target not in FILES for asked in READERS[target] if "--overwrite" not in asked
+    ]
+    right = dict.fromkeys(tuple(p.format(file=f"{HERE}/certificate.h5") for p in asked) for asked in quick)
+    preload(configs(), list(right))
     tally = Tally.resumed(folder / "summary.json", given.seed)
     every = max(1, given.mutants // given.fresh) if given.fresh else 0
     while tally.next < given.seed + given.mutants:
