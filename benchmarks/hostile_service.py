@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import gzip
 import html
 import json
@@ -190,6 +191,12 @@ def wild_head(rng: random.Random) -> str:
     )
 
 
+@functools.cache
+def bomb() -> bytes:
+    """A small body that unpacks into 128 MiB."""
+    return gzip.compress(b" " * 2**27, 9)
+
+
 QUICK: dict[str, Callable[[random.Random], Pieces]] = {
     "closed at once": lambda r: iter([]),
     "garbage": lambda r: iter([r.randbytes(r.choice([1, 100, 70_000]))]),
@@ -203,7 +210,7 @@ QUICK: dict[str, Callable[[random.Random], Pieces]] = {
     "error body of gigabytes": lambda r: endless(b"HTTP/1.1 503 No\r\n\r\n", b"a" * 2**16),
     "chunks of gigabytes": lambda r: endless(CHUNKED, b"10000\r\n" + b" " * 2**16 + b"\r\n"),
     "a chunk of exabytes": lambda r: iter([CHUNKED + b"F" * r.choice([15, 16, 17, 4000]) + b"\r\na"]),
-    "compressed bomb": lambda r: reply(gzip.compress(b" " * 2**27, 9), head="Content-Encoding: gzip\r\n"),
+    "compressed bomb": lambda r: reply(bomb(), head="Content-Encoding: gzip\r\n"),
     "body cut off": lambda r: iter([OK + b"Content-Length: 900\r\n\r\n" + completion(GOOD).encode()]),
     "deep JSON": lambda r: reply(r.choice(["[", '{"a":', '{"choices":[']) * r.choice([500, 5000, 150_000])),
     "long numbers": lambda r: reply('{"choices": ' + "9" * r.choice([300, 5000, 900_000]) + "}"),

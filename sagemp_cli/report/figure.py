@@ -7,15 +7,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from sagemp_cli.report.bounded_canvas import BoundedCanvas
 from sagemp_cli.storage.atomic import write_whole
 
+_TOO_LARGE = {"over": "ignore", "invalid": "ignore"}
+"""Scaling somebody else's numbers to a picture may overflow: what is drawn is bounded all the same."""
+
 
 def draw_beside(artifact: Path, draw: Callable[..., Figure], *artifacts: Any) -> Path:
     """Draw a figure of artifacts and save it as ``<artifact>.png`` beside the file that it shows."""
-    return save_figure(draw(*artifacts), artifact.with_suffix(".png"))
+    with np.errstate(**_TOO_LARGE):
+        return save_figure(draw(*artifacts), artifact.with_suffix(".png"))
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -26,5 +31,6 @@ def save_figure(figure: Figure, path: Path) -> Path:
     """
     BoundedCanvas(figure)
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", metadata={"Software": "sagemp"})
+    with np.errstate(**_TOO_LARGE):
+        figure.savefig(drawn, format="png", metadata={"Software": "sagemp"})
     return write_whole(path, drawn.getvalue(), overwrite=True)

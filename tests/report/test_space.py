@@ -62,3 +62,12 @@ def test_a_tube_is_drawn_partly_behind_and_partly_before_the_obstacle(axes, prob
     orders = [c.get_zorder() for c in drawn]
     assert min(orders) < 2 < max(orders), "the sphere has zorder 2"
     assert save_figure(axes.figure, tmp_path / "space.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("far", [1e9, 1e100, 1e300])
+def test_a_reference_of_any_size_is_drawn(axes, problem, tmp_path, far):
+    tubes = straight_tubes(problem)
+    tubes.references[0, 1::2, :3] = far
+    with np.errstate(all="ignore"):
+        space_tube(axes, problem, tubes, 0)
+    assert save_figure(axes.figure, tmp_path / "space.png").stat().st_size > 10_000
