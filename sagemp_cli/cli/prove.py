@@ -22,6 +22,7 @@ EXAMPLES = examples(
     "sagemp prove my_loop.py:step --start 1:1.2,0:0.2 --disturbance -0.01:0.01 --horizon 20 --scene scene.yaml",
     "sagemp prove my_loop.py:step --start 1:1.2,0:0.2 --horizon 20 --names angle,rate --units rad,rad/s --dt 0.05",
     "sagemp check my_loop_step.h5",
+    "sagemp prove my_robot.py:Robot --network controller.onnx",
 )
 
 
@@ -30,8 +31,13 @@ def prove(
         str, typer.Argument(metavar="FILE:NAME", help="A step in torch: a function, module or loop of a Python file.")
     ],
     start: Annotated[
-        str, typer.Option(metavar="BOX", help="X_I: one interval or number for each state, e.g. 0.9:1.1,0.")
-    ],
+        str | None,
+        typer.Option(
+            metavar="BOX",
+            help="X_I: one interval or number for each state, e.g. 0.9:1.1,0; an ODE may have its own.",
+            show_default=False,
+        ),
+    ] = None,
     horizon: Annotated[
         int | None,
         typer.Option(metavar="K", min=1, help="Number of steps; a loop may have its own.", show_default=False),
@@ -77,6 +83,30 @@ def prove(
     budget: Annotated[int, typer.Option(min=1, help="Cells at most with auto.")] = 64,
     propagator: Annotated[str, typer.Option(help="affine, best, crown, interval or auto_lirpa.")] = "affine",
     seed: Annotated[int, typer.Option(min=0, help="Of the attacks on a claim that is not proved.")] = 0,
+    network: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Of an ODE: an ONNX file, which its control(x, network) gets.", show_default=False
+        ),
+    ] = None,
+    period: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS", help="Of an ODE: between two samples; it may have its own.", show_default=False
+        ),
+    ] = None,
+    substeps: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Of an ODE: parts of a period, a power of two; as needed by default.", show_default=False
+        ),
+    ] = None,
+    order: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Of an ODE: degree of the Taylor polynomials; as needed by default.", show_default=False
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The certificate; FILE_NAME.h5 here by default.", show_default=False),
@@ -91,41 +121,81 @@ def prove(
     is recorded as a program, which is bounded, judged and attacked. Writes a certificate, which carries the program,
     and a figure beside it. Without a scene and a goal it proves that the states stay in a bounded tube. Exit code: 0
     certified, 10 falsified, 5 unknown.
+
+    An object or a class with [bold]rate(x, u)[/bold] and [bold]control(x)[/bold] is a robot as an ODE whose control is
+    held for a period: what is proved holds at all times, between the samples too. It may say its period, horizon,
+    start, disturbance, state_names and requirements itself. No certificate is written of it, only the figure.
     """
     import torch
 
+    from sagemp_cli.cli.ode_verdict import ode_as_data, ode_as_lines
     from sagemp_cli.cli.time_limit import time_limit as limited
     from sagemp_cli.config.folders import mapping_in
     from sagemp_cli.plugins.loading import load_object
     from sagemp_cli.stages.prove import prove as proved
+    from sagemp_cli.stages.prove_ode import is_plant, plant_of, prove_ode
 
     torch.set_num_threads(1)
     step, name = load_object(target)
     path = Path(f"{name}.h5") if output is None else output
+    boxes = {
+        "start": None if start is None else _box("--start", start),
+        "disturbance": None if disturbance is None else _box("--disturbance", disturbance),
+        "goal": None if goal is None else _box("--goal", goal, open_ends=True),
+    }
+    common = {
+        "scene": None if scene is None else mapping_in(scene, f"scene file {scene}"),
+        "position": None if position is None else _words(position),
+        "state_names": None if names is None else _words(names),
+        "state_units": None if units is None else _words(units),
+        "propagator": propagator,
+        "partitions": int(partitions) if partitions.isdigit() else partitions,
+        "budget": budget,
+        "seed": seed,
+        "name": name,
+    }
+    of_ode = {"network": network, "period": period, "substeps": substeps, "order": order}
+    if is_plant(step):
+        of_steps = {"dt": dt, "output": output, "between": None if between == "segments" else between}
+        _refuse(of_steps, f"{target} is an ODE, judged at all times, and no certificate is written yet")
+        with limited(time_limit):
+            found = prove_ode(
+                plant_of(step, network),
+                **boxes,
+                **common,
+                horizon=horizon,
+                period=period,
+                substeps=substeps,
+                order=order,
+                figure=path.with_suffix(".png"),
+            )
+        said = ode_as_data(found) | {"figure": str(path.with_suffix(".png"))}
+        typer.echo(json.dumps(said, indent=2) if as_json else printable("\n".join(ode_as_lines(said))))
+        raise typer.Exit(ANSWER_CODES[str(found.answer)])
+    _refuse(of_ode, f"{target} is a step, no ODE: it has no rate(x, u)")
+    if boxes["start"] is None:
+        raise UsageError("--start is missing: X_I, one interval or number for each state")
     with limited(time_limit):
         proof = proved(
             step,
-            _box("--start", start),
-            None if disturbance is None else _box("--disturbance", disturbance),
-            horizon,
-            scene=None if scene is None else mapping_in(scene, f"scene file {scene}"),
-            goal=None if goal is None else _box("--goal", goal, open_ends=True),
-            position=None if position is None else _words(position),
+            horizon=horizon,
+            **boxes,
+            **common,
             between=between,
-            state_names=None if names is None else _words(names),
-            state_units=None if units is None else _words(units),
             dt=dt,
-            propagator=propagator,
-            partitions=int(partitions) if partitions.isdigit() else partitions,
-            budget=budget,
-            seed=seed,
             certificate=path,
             overwrite=overwrite,
-            name=name,
         )
     data = as_data(proof, dt) | {"certificate": str(path), "figure": str(path.with_suffix(".png"))}
     typer.echo(json.dumps(data, indent=2) if as_json else printable("\n".join(as_lines(data))))
     raise typer.Exit(ANSWER_CODES[str(proof.answer)])
+
+
+def _refuse(options: dict[str, Any], why: str) -> None:
+    """Options that mean nothing here are an error, never ignored."""
+    for name, value in options.items():
+        if value is not None:
+            raise UsageError(f"--{name} means nothing here: {why}")
 
 
 def as_data(proof: LoopProof, dt: float | None = None) -> dict[str, Any]:

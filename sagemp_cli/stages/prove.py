@@ -89,10 +89,10 @@ def prove(
     n = start.dim if isinstance(start, Box) else 0
     names = _words("state_names", state_names, [f"x{i}" for i in range(n)])
     units = _words("state_units", state_units, [""] * n)
-    problem = _scene(scene, goal)
+    problem = scene_data(scene, goal)
     if between not in (Between.SEGMENTS, Between.SAMPLES):
         raise UsageError(f"between must be '{Between.SEGMENTS}' or '{Between.SAMPLES}', found {between!r}")
-    claim = _claim(problem, names, position, Between(between))
+    claim = claim_of(problem, names, position, Between(between))
     if dt is not None and not (isinstance(dt, int | float) and 0 < dt < math.inf):
         raise UsageError(f"dt must be a positive number of seconds, found {dt!r}")
     chosen, counts = propagator_of(propagator), counts_of(partitions, start)
@@ -147,7 +147,7 @@ def _words(key: str, given: Sequence[str] | None, default: Sequence[str]) -> tup
     return words
 
 
-def _scene(given: Mapping[str, Any] | None, goal: Box | None) -> dict[str, Any]:
+def scene_data(given: Mapping[str, Any] | None, goal: Box | None) -> dict[str, Any]:
     """The scene as plain data with the goal in it; empty if there is nothing in it."""
     if given is not None and not isinstance(given, Mapping):
         raise UsageError(f"scene must be a mapping with some of {', '.join(SCENE_KEYS)}, found {type(given).__name__}")
@@ -163,7 +163,7 @@ def _scene(given: Mapping[str, Any] | None, goal: Box | None) -> dict[str, Any]:
     return scene if scene.keys() & {"workspace", "obstacles", "goal"} else {}
 
 
-def _claim(
+def claim_of(
     scene: Mapping[str, Any], names: tuple[str, ...], position: Sequence[int | str] | None, between: Between
 ) -> LoopClaim:
     """What a scene claims; what it does not say is infinite."""

@@ -125,6 +125,8 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
         here = Box(*(_settled(side[:, -1]) for side in (block.run.tube.lower, block.run.tube.upper)))
         guess = block.extrapolated()
         at, length = stop, min(2 * length, _LONGEST)
+        if bool((failed < at).all()):  # nothing that follows would count
+            break
     run, rest = _joined([b.run for b in blocks]), loop.horizon - at
     between = Flow.join([b.flow for b in blocks], 1)
     assert between is not None

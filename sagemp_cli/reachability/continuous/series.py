@@ -30,12 +30,15 @@ class Series:
         program: whose values; it must not read its disturbance.
         state: coefficients of the state, which may become more between calls of :meth:`next_order`.
         numbers: of the program's numbers, which do not change in time.
+        output: the slot whose coefficients are asked for; the program's output ``next`` by default.
 
     Raises:
         UnsupportedOperationError: an operation without derivatives.
     """
 
-    def __init__(self, out: Writer, program: Program, state: Coefficients, numbers: int | None) -> None:
+    def __init__(
+        self, out: Writer, program: Program, state: Coefficients, numbers: int | None, output: int | None = None
+    ) -> None:
         for i in program.instructions:
             if i.kind in UNSMOOTH:
                 raise UnsupportedOperationError(
@@ -44,15 +47,16 @@ class Series:
                 )
         self._out, self._program, self._state = out, program, state
         self._numbers = numbers
+        self._wanted = program.outputs.next if output is None else output
         self._values: list[Coefficients] = [[] for _ in program.instructions]
         self._beside: dict[tuple[str, int], Coefficients] = {}
 
     def next_order(self) -> int | None:
-        """Of the program's output ``next``, the coefficient after those that were asked for."""
+        """Of what is asked for, the coefficient after those that were asked for."""
         q = len(self._values[0])
         for slot, i in enumerate(self._program.instructions):
             self._values[slot].append(self._coefficient(slot, i, q))
-        return self._values[self._program.outputs.next][q]
+        return self._values[self._wanted][q]
 
     def _coefficient(self, slot: int, i: Instruction, q: int) -> int | None:
         if i.kind == "state":

@@ -1,0 +1,92 @@
+"""Into how many parts a period is cut, where nobody says: so many that remainders are a small share of the tube.
+
+What a Taylor polynomial leaves out goes into the tube as an interval that nothing contracts. Its width over a period
+beside the width of the tube says whether more parts would help: halving a part divides it by ``2^p`` a period.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.continuous.reach import MOST_SUBSTEPS, reach_continuously
+from sagemp_cli.reachability.continuous.sampled import SampledLoop
+from sagemp_cli.reachability.flow import Division
+from sagemp_cli.reachability.propagator import Propagator, Reach
+from sagemp_cli.sets import Box
+
+ENOUGH = 0.02
+"""Share of the tube's width that the remainders of a period may have, to begin with."""
+
+FINE = 0.002
+"""The share from which on more parts would not narrow the tube."""
+
+_PROGRESS = 0.8
+"""Share of the periods without enclosure that may be left by a finer division, for it to go on."""
+
+TRIED = 4
+"""Periods of a trial."""
+
+
+FLOOR = 0.01
+"""A tube that is narrower than this share of how far it goes counts as that wide, before anything says otherwise."""
+
+
+def remainder_share(reach: Reach, floor: float = 0.0) -> Tensor:
+    """Of each cell, widths of the remainders of a period beside those of the tube, of the worst state; ``(C,)``.
+
+    Averages over all periods; infinite where the tube is not bounded. A width counts as at least ``floor`` times that
+    of a box around the whole tube.
+    """
+    flow = reach.flow
+    assert flow is not None
+    left_out = (flow.remainder_upper - flow.remainder_lower).sum(2).mean(1)
+    around = reach.tube.upper.amax(1) - reach.tube.lower.amin(1)
+    share = left_out / torch.maximum(reach.tube.width[:, 1:].mean(1), floor * around)
+    return torch.nan_to_num(torch.where(left_out == 0, 0.0, share), nan=torch.inf).amax(-1)
+
+
+ORDERS = (2, 3)
+"""Degrees of the Taylor polynomials, at first, and where that does not do."""
+
+
+def finer(division: Division, substeps: int | None, order: int | None) -> Division | None:
+    """The next division to try: a higher order, then twice as many parts; None if there is none.
+
+    Args:
+        division: what did not do.
+        substeps, order: None where it may be changed.
+    """
+    if order is None and division.order < ORDERS[-1]:
+        return Division(division.substeps, ORDERS[-1])
+    if substeps is None and 2 * division.substeps <= MOST_SUBSTEPS:
+        return Division(2 * division.substeps, division.order)
+    return None
+
+
+def suggested(
+    propagator: Propagator, loop: SampledLoop, cells: Box, w: Box, *, substeps: int | None, order: int | None
+) -> Division:
+    """A division to begin with, by trials on the first periods of cells ``(C, n)``; what is given stays."""
+    first = loop.part(0, min(TRIED, loop.horizon))
+    division: Division | None = Division(substeps or 1, order or ORDERS[0])
+    best, least, lost = division, torch.inf, math.inf
+    while division is not None:
+        found = reach_continuously(propagator, first, cells, w, substeps=division.substeps, order=division.order)
+        share, now = float(remainder_share(found, FLOOR).amax()), periods_lost(found)
+        if share < least or now < lost:
+            best, least = division, share
+        if share <= ENOUGH or (0 < now < first.horizon and now > _PROGRESS * lost):
+            break
+        division, lost = finer(division, substeps, order), min(now, lost)
+    return best
+
+
+def periods_lost(reach: Reach) -> int:
+    """Periods of which the worst cell has no enclosure."""
+    flow = reach.flow
+    assert flow is not None
+    known = torch.isfinite(flow.remainder_lower) & torch.isfinite(flow.remainder_upper)
+    return int((~known.flatten(2).all(-1)).sum(1).amax())

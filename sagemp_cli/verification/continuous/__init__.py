@@ -1,0 +1,1 @@
+"""Verdicts about loops in continuous time: requirements judged on flows, attacked, and proved cell by cell."""

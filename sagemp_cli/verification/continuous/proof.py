@@ -1,0 +1,395 @@
+"""The verdict about a loop in continuous time: attacked, bounded cell by cell, judged.
+
+Cells whose proof fails are tried again. Where the remainders of the Taylor polynomials are a noticeable share of the
+tube, more parts a period are taken; else the cells are halved, in the state whose halves miss least together: it is
+looked for in the cell that misses most, and all are halved in it, since a batch of cells costs little more than one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sagemp_cli.reachability.any_loop import cells_of
+from sagemp_cli.reachability.continuous.division import FINE, finer, remainder_share, suggested
+from sagemp_cli.reachability.continuous.observed import ObservedOde
+from sagemp_cli.reachability.continuous.reach import reach_continuously
+from sagemp_cli.reachability.continuous.sampled import SampledLoop
+from sagemp_cli.reachability.flow import Division, Flow
+from sagemp_cli.reachability.propagator import Propagator, Reach
+from sagemp_cli.reachability.recording import Recording
+from sagemp_cli.scenes.requirements import Formula
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.continuous.attack import Violation, search
+from sagemp_cli.verification.continuous.judging import Asked, Judgement, judged
+from sagemp_cli.verification.verdict import Answer
+
+_PATIENCE = 3
+"""Halvings in a row that may be in vain, before the rest is given up."""
+
+_GAIN = 0.02
+"""A halving is in vain if what is missing falls by less than this share of it."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some cells that were bounded in one call.
+
+    Attributes:
+        cells: ``(C, n)``.
+        reach: of them.
+        judgement: what that proves.
+    """
+
+    cells: Box
+    reach: Reach
+    judgement: Judgement
+
+    def of(self, index: Tensor) -> Piece:
+        """The same for some of the cells."""
+        r, j = self.reach, self.judgement
+        assert r.flow is not None
+        controls = [None if side is None else side[index] for side in (r.control_lower, r.control_upper)]
+        return Piece(
+            Box(self.cells.lower[index], self.cells.upper[index]),
+            replace(
+                r,
+                tube=Tube(r.tube.lower[index], r.tube.upper[index]),
+                control_lower=controls[0],
+                control_upper=controls[1],
+                recording=None if r.recording is None else r.recording.select(index),
+                flow=r.flow.select(index),
+            ),
+            Judgement(j.margin[index], j.time[index], j.holds[index], j.missing[index]),
+        )
+
+
+@dataclass(frozen=True)
+class RequirementVerdict:
+    """What is known of a requirement.
+
+    Attributes:
+        name: of it.
+        answer: about it alone.
+        margin: certain for all solutions, at least; what a violation misses by, negative, if there is one.
+        time: in seconds, when the margin is so small, or the first time at which it is not proved, or is broken.
+    """
+
+    name: str
+    answer: Answer
+    margin: float
+    time: float
+
+
+@dataclass(frozen=True)
+class OdeProof:
+    """What was found out about a loop in continuous time.
+
+    Attributes:
+        loop: the recorded programs that it is about.
+        start, disturbance: X_I and W.
+        requirements: what was asked.
+        pieces: all cells; together they cover X_I.
+        verdicts: one for each requirement.
+        bounded: whether all states were bounded up to the end.
+        violation: a solution that breaks a requirement, if one was found.
+        seconds: of processor time.
+        notes: of the propagator.
+        propagator: its name.
+    """
+
+    loop: SampledLoop
+    start: Box
+    disturbance: Box
+    requirements: tuple[Formula, ...]
+    pieces: tuple[Piece, ...]
+    verdicts: tuple[RequirementVerdict, ...]
+    bounded: bool
+    violation: Violation | None
+    seconds: float
+    notes: tuple[str, ...]
+    propagator: str
+
+    @property
+    def answer(self) -> Answer:
+        """VERIFIED, FALSIFIED or UNKNOWN."""
+        answers = {v.answer for v in self.verdicts}
+        if Answer.FALSIFIED in answers:
+            return Answer.FALSIFIED
+        return Answer.VERIFIED if self.bounded and answers <= {Answer.VERIFIED} else Answer.UNKNOWN
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return sum(len(p.cells.lower) for p in self.pieces)
+
+    @property
+    def divisions(self) -> tuple[Division, ...]:
+        """How the period was cut for some of the cells, each division once."""
+        return tuple(dict.fromkeys(p.reach.flow.division for p in self.pieces if p.reach.flow is not None))
+
+    @property
+    def tube(self) -> Tube:
+        """Around all solutions at the instants, ``(K+1, n)``."""
+        tubes = [p.reach.tube.hull() for p in self.pieces]
+        return Tube(torch.stack([t.lower for t in tubes]).amin(0), torch.stack([t.upper for t in tubes]).amax(0))
+
+    @property
+    def between(self) -> Box:
+        """Around all solutions over each period, ``(K, n)``."""
+        flows = [p.reach.flow for p in self.pieces if p.reach.flow is not None]
+        return Box(
+            torch.stack([f.lower.amin((0, 2)) for f in flows]).amin(0),
+            torch.stack([f.upper.amax((0, 2)) for f in flows]).amax(0),
+        )
+
+
+def verify_ode(
+    seen: ObservedOde,
+    propagator: Propagator,
+    formulas: Sequence[Formula],
+    *,
+    counts: Sequence[int] | None,
+    budget: int = 64,
+    cells_at_once: int = 64,
+    substeps: int | None = None,
+    order: int | None = None,
+    restarts: int = 1,
+    generator: torch.Generator,
+) -> OdeProof:
+    """Attack, bound and judge a loop in continuous time.
+
+    Args:
+        seen: the recorded loop, its start box and its disturbance box.
+        propagator: bounds it.
+        formulas: what is to be proved at all times; nothing asks for a bounded tube only.
+        counts: cells per uncertain start dimension; None where more are taken as the proof needs them.
+        budget: cells at most then.
+        cells_at_once: cells in one call of the propagator.
+        substeps, order: see :func:`~sagemp_cli.reachability.continuous.reach.reach_continuously`.
+        restarts: 0 for no attack.
+        generator: draws where attacks begin.
+
+    Raises:
+        UsageError: functions that are found to differ from what was recorded of them, or a requirement that does not
+            fit.
+        UnsupportedOperationError: what cannot be bounded in continuous time.
+    """
+    began = time.process_time()
+    example = seen.start.center
+    asked = [Asked.of(f, seen.loop, example) for f in formulas]
+    violation = None
+    if restarts:
+        violation = search(seen.loop, seen.start, seen.disturbance, asked, generator=generator, ascents=False)
+    if violation is not None and violation.proved:
+        spent = time.process_time() - began
+        return _refuted(seen, asked, violation, propagator, spent)
+    work = _Work(seen, propagator, asked, cells_at_once, substeps, order)
+    cells = cells_of(seen.start, counts or [])
+    pieces = work.proved(cells, budget if counts is None else 0)
+    for piece in pieces:
+        seen.compare(piece.reach)
+    verdicts = _verdicts(asked, pieces)
+    bounded = all(
+        bool(torch.isfinite(p.reach.tube.upper).all() & torch.isfinite(p.reach.tube.lower).all()) for p in pieces
+    )
+    if restarts and any(v.answer is not Answer.VERIFIED for v in verdicts):
+        open_ones = [a for a, v in zip(asked, verdicts, strict=True) if v.answer is not Answer.VERIFIED]
+        more = search(seen.loop, seen.start, seen.disturbance, open_ones, generator=generator, ascents=True)
+        violation = more if more is not None else violation
+    if violation is not None:
+        for i, v in enumerate(verdicts):
+            if v.name == violation.requirement and violation.proved:
+                verdicts[i] = RequirementVerdict(v.name, Answer.FALSIFIED, -violation.depth, violation.time)
+    notes = tuple(dict.fromkeys(note for p in pieces for note in p.reach.notes))
+    return OdeProof(
+        seen.loop,
+        seen.start,
+        seen.disturbance,
+        tuple(formulas),
+        tuple(pieces),
+        tuple(verdicts),
+        bounded,
+        violation,
+        time.process_time() - began,
+        notes,
+        propagator.name,
+    )
+
+
+class _Work:
+    """Bounds and judges cells."""
+
+    def __init__(
+        self,
+        seen: ObservedOde,
+        propagator: Propagator,
+        asked: Sequence[Asked],
+        at_once: int,
+        substeps: int | None,
+        order: int | None,
+    ) -> None:
+        self.loop, self.w, self.propagator, self.asked, self.at_once = (
+            seen.loop,
+            seen.disturbance,
+            propagator,
+            asked,
+            at_once,
+        )
+        self.given = {"substeps": substeps, "order": order}
+
+    def proved(self, cells: Box, budget: int) -> list[Piece]:
+        """Pieces that cover the cells, halved up to a budget where their proof fails."""
+        division = suggested(self.propagator, self.loop, cells, self.w, **self.given)
+        done: list[Piece] = []
+        piece, vain, refines = self.piece(cells, division), 0, True
+        while True:
+            open_ones = ~piece.judgement.holds.all(1)
+            done.append(piece.of(torch.nonzero(~open_ones)[:, 0]))
+            piece = piece.of(torch.nonzero(open_ones)[:, 0])
+            count = len(piece.cells.lower)
+            if not count:
+                break
+            more = finer(division, **self.given) if refines and self.coarse(piece.reach) else None
+            if more is not None:
+                again = self.piece(piece.cells, more)
+                refines = float(again.judgement.missing.sum()) < (1 - _GAIN) * float(piece.judgement.missing.sum())
+                if refines:
+                    piece, division = again, more
+                    continue
+            settled = sum(len(p.cells.lower) for p in done)
+            if settled + 2 * count > budget or vain >= _PATIENCE:
+                break
+            before = float(piece.judgement.missing.sum())
+            halves = self.halved(piece, division)
+            if halves is None:
+                break
+            piece = halves
+            vain = vain + 1 if float(piece.judgement.missing.sum()) > 2 * (1 - _GAIN) * before else 0
+        return [p for p in (*done, piece) if len(p.cells.lower)]
+
+    def coarse(self, reach: Reach) -> bool:
+        """Whether more parts would help."""
+        return bool((remainder_share(reach) > FINE).any())
+
+    def piece(self, cells: Box, division: Division) -> Piece:
+        """Cells bounded and judged."""
+        reaches = [
+            reach_continuously(
+                self.propagator,
+                self.loop,
+                Box(low, high),
+                self.w,
+                substeps=division.substeps,
+                order=division.order,
+            )
+            for low, high in zip(cells.lower.split(self.at_once), cells.upper.split(self.at_once), strict=True)
+        ]
+        reach = _joined(reaches)
+        return Piece(cells, reach, judged(reach, self.asked, self.loop, self.w))
+
+    def halved(self, piece: Piece, division: Division) -> Piece | None:
+        """The halves of all cells; None if they cannot be halved.
+
+        Each in the state whose halves miss least together. Where trials of all would be more than one call, all are
+        halved in the state that is best for the one that misses most.
+        """
+        count = len(piece.cells.lower)
+        dimensions = [
+            i
+            for i in torch.nonzero(piece.cells.width.amin(0) > 0)[:, 0].tolist()
+            if bool((_halved(piece.cells, i).width[:, i] > 0).all())
+        ]
+        if not dimensions:
+            return None
+        if len(dimensions) == 1:
+            return self.piece(_halved(piece.cells, dimensions[0]), division)
+        together = 2 * count * len(dimensions) <= self.at_once
+        tried = piece.cells if together else _row(piece.cells, int(piece.judgement.missing.argmax()))
+        halves = [_halved(tried, i) for i in dimensions]
+        trial = self.piece(Box(*(torch.cat([getattr(h, s) for h in halves]) for s in ("lower", "upper"))), division)
+        shape = (len(dimensions), len(tried.lower), 2)
+        missing = trial.judgement.missing.reshape(shape).sum(2)
+        width = torch.nan_to_num(trial.reach.tube.width[:, 1:], nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
+        spread = width.log().mean((1, 2)).reshape(shape).sum(2)
+        # Of those that miss least, up to rounding, the one with the narrowest tubes.
+        tied = missing <= missing.amin(0) * (1 + 1e-6)
+        best = torch.where(tied, spread, torch.inf).argmin(0)
+        if not together:
+            return self.piece(_halved(piece.cells, dimensions[int(best[0])]), division)
+        index = torch.arange(trial.cells.lower.shape[0]).reshape(shape)[best, torch.arange(count)].flatten()
+        return trial.of(index)
+
+
+def _row(cells: Box, index: int) -> Box:
+    return Box(cells.lower[index : index + 1], cells.upper[index : index + 1])
+
+
+def _halved(cells: Box, dimension: int) -> Box:
+    """Both halves of every cell, one after the other; they share their face exactly."""
+    middle = cells.center[:, dimension]
+    lower, upper = (side.repeat_interleave(2, 0) for side in (cells.lower, cells.upper))
+    upper[0::2, dimension] = middle
+    lower[1::2, dimension] = middle
+    return Box(lower, upper)
+
+
+def _joined(reaches: Sequence[Reach]) -> Reach:
+    """Of the same loop and division, as one."""
+    if len(reaches) == 1:
+        return reaches[0]
+    flows = [r.flow for r in reaches if r.flow is not None]
+    lower, upper = ([getattr(r, f"control_{side}") for r in reaches] for side in ("lower", "upper"))
+    known = all(side is not None for side in (*lower, *upper))
+    return Reach(
+        Tube(*(torch.cat([getattr(r.tube, side) for r in reaches]) for side in ("lower", "upper"))),
+        torch.cat(lower) if known else None,
+        torch.cat(upper) if known else None,
+        Recording.join([r.recording for r in reaches]),
+        tuple(dict.fromkeys(note for r in reaches for note in r.notes)),
+        Flow.join(flows),
+    )
+
+
+def _verdicts(asked: Sequence[Asked], pieces: Sequence[Piece]) -> list[RequirementVerdict]:
+    found = []
+    for i, one in enumerate(asked):
+        margin = torch.cat([p.judgement.margin[:, i] for p in pieces])
+        when = torch.cat([p.judgement.time[:, i] for p in pieces])
+        holds = torch.cat([p.judgement.holds[:, i] for p in pieces])
+        proved = bool(holds.all())
+        time_of = float(when[margin.argmin()]) if proved else float(when[~holds].min())
+        answer = Answer.VERIFIED if proved else Answer.UNKNOWN
+        found.append(RequirementVerdict(one.formula.name, answer, float(margin.min()), time_of))
+    return found
+
+
+def _refuted(
+    seen: ObservedOde, asked: Sequence[Asked], violation: Violation, propagator: Propagator, seconds: float
+) -> OdeProof:
+    """The verdict where a violation was found before anything was bounded."""
+    verdicts = [
+        RequirementVerdict(a.formula.name, Answer.FALSIFIED, -violation.depth, violation.time)
+        if a.formula.name == violation.requirement
+        else RequirementVerdict(a.formula.name, Answer.UNKNOWN, -math.inf, 0.0)
+        for a in asked
+    ]
+    formulas = tuple(a.formula for a in asked)
+    return OdeProof(
+        seen.loop,
+        seen.start,
+        seen.disturbance,
+        formulas,
+        (),
+        tuple(verdicts),
+        False,
+        violation,
+        seconds,
+        (),
+        propagator.name,
+    )

@@ -1,0 +1,159 @@
+"""Loops in continuous time: proved at all times, refuted by enclosures, or unknown, and never in between."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from sagemp_cli.errors import UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.observed import observed_ode
+from sagemp_cli.scenes.requirements import Holds, Inside, Outside
+from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.continuous.judging import Asked, judged
+from sagemp_cli.verification.continuous.proof import verify_ode
+from sagemp_cli.verification.verdict import Answer
+
+NAMES = ("angle", "rate")
+
+
+def control(x):
+    return (-2 * x[..., :1] - x[..., 1:]).clamp(-1.0, 1.0)
+
+
+def rate(x, u):
+    return torch.cat([x[..., 1:], torch.sin(x[..., :1]) - 0.2 * x[..., 1:] + 3 * u], -1)
+
+
+def box(lower, upper):
+    return Box(torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64))
+
+
+START = box([0.2, -0.1], [0.3, 0.1])
+
+
+def seen(f=rate, c=control, start=START, w=None, period=0.1, horizon=12):
+    return observed_ode(f, c, start, w, period=period, horizon=horizon)
+
+
+def verdict(*requirements, observed=None, counts=None, **options):
+    return verify_ode(
+        observed or seen(),
+        Affine(),
+        [r.formula(NAMES) for r in requirements],
+        counts=counts,
+        generator=torch.Generator().manual_seed(0),
+        **options,
+    )
+
+
+def test_what_holds_is_proved_and_says_its_margin():
+    proof = verdict(
+        Inside({"angle": (-0.5, 0.5)}), Inside({"angle": (-0.2, 0.2)}, when=(0.8, 1.2)), Outside({"angle": (1, 2)})
+    )
+    assert proof.answer is Answer.VERIFIED
+    assert all(v.margin > 0 and v.answer is Answer.VERIFIED for v in proof.verdicts)
+    assert proof.cells == 1 and proof.violation is None
+
+
+def test_what_is_false_is_refuted_by_an_enclosure_of_the_solution():
+    proof = verdict(Inside({"angle": (-1.0, 0.25)}), Inside({"rate": (-5.0, 5.0)}))
+    assert proof.answer is Answer.FALSIFIED
+    broken = proof.violation
+    assert broken.proved and broken.requirement == "inside" and broken.depth > 0
+    assert bool(((START.lower <= broken.start) & (broken.start <= START.upper)).all())
+
+
+def test_a_violation_between_two_samples_alone_is_not_called_proved():
+    """A body that swings out and back within one period: at the samples it is at 0."""
+    swing = lambda x, u: torch.cat([x[..., 1:], -(math.pi**2) * x[..., :1] + 0 * u], -1)  # noqa: E731
+    start = box([0.0, 1.0], [0.0, 1.0])
+    observed = seen(swing, lambda x: 0 * x[..., :1], start, period=1.0, horizon=2)
+    peak = 1 / math.pi
+    inside = Inside({"angle": (-peak * 0.98, peak * 0.98)})
+    assert verdict(inside, observed=observed, restarts=0, substeps=4, order=3).answer is Answer.UNKNOWN
+    assert verdict(inside, observed=observed).answer is Answer.FALSIFIED
+    wide = Inside({"angle": (-peak * 1.2, peak * 1.2)})
+    assert verdict(wide, observed=observed, substeps=4, order=3).answer is Answer.VERIFIED
+
+
+def test_more_cells_are_taken_where_one_does_not_do():
+    wide = seen(start=box([-0.6, -0.6], [0.6, 0.6]))
+    anything = Inside({"angle": (-99.0, 99.0)})
+    one, many = (
+        float(verdict(anything, observed=wide, counts=c, restarts=0).tube.upper[-1, 0]) for c in ([1, 1], [4, 4])
+    )
+    tight = Inside({"angle": (-0.5 * (one + many), 0.5 * (one + many))}, when="end")
+    assert verdict(tight, observed=wide, counts=[1, 1], restarts=0).answer is Answer.UNKNOWN
+    proof = verdict(tight, observed=wide)
+    assert proof.answer is Answer.VERIFIED and proof.cells > 1
+    lower = torch.cat([p.cells.lower for p in proof.pieces]).amin(0)
+    upper = torch.cat([p.cells.upper for p in proof.pieces]).amax(0)
+    volume = torch.cat([p.cells.width.prod(-1) for p in proof.pieces]).sum()
+    assert torch.equal(lower, wide.start.lower) and torch.equal(upper, wide.start.upper)
+    assert float(volume) == pytest.approx(float(wide.start.width.prod()))
+
+
+def test_nothing_that_is_not_a_number_proves_anything():
+    observed = seen()
+    asked = [Asked.of(Inside({"angle": (-5.0, 5.0)}).formula(NAMES), observed.loop, START.center)]
+    reach = verdict(Inside({"angle": (-5.0, 5.0)})).pieces[0].reach
+    w = observed.disturbance
+    assert bool(judged(reach, asked, observed.loop, w).holds.all())
+    for name in ("lower", "upper", "state_lower", "state_upper"):
+        side = getattr(reach.flow, name).clone()
+        side[0, 3, 0, 0] = math.nan
+        spoilt = dataclasses.replace(reach, flow=dataclasses.replace(reach.flow, **{name: side}))
+        assert not bool(judged(spoilt, asked, observed.loop, w).holds.any()), name
+    for name in ("lower", "upper"):
+        sides = {n: getattr(reach.tube, n).clone() for n in ("lower", "upper")}
+        sides[name][0, -1, 0] = math.nan
+        spoilt = dataclasses.replace(reach, tube=Tube(**sides))
+        assert not bool(judged(spoilt, asked, observed.loop, w).holds.any()), name
+
+
+def test_what_escapes_is_unknown_with_a_note():
+    observed = seen(lambda x, u: 4 * x * x + 0 * u, lambda x: 0 * x[..., :1], box([1.0, 1.0], [1.1, 1.1]))
+    proof = verdict(Inside({"angle": (-9.0, 1e9)}), observed=observed, restarts=0, substeps=4, order=2, counts=[1, 1])
+    assert proof.answer is Answer.UNKNOWN and not proof.bounded
+    assert any("no box was found" in note for note in proof.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"period": 0}, "period must be a positive number of seconds, found 0"),
+        ({"period": math.nan}, "period must be a positive number of seconds"),
+        ({"horizon": 0}, "horizon must be a positive integer, found 0"),
+        ({"w": box([0.0], [1.0])}, "the disturbance must have 2 dimensions, found 1"),
+        ({"c": lambda x: torch.full((1,), math.nan)}, "control must give finite numbers"),
+        ({"f": lambda x, u: x[..., :1]}, "shape"),
+        ({"c": lambda x: torch.rand(1).double() + 0 * x[..., :1]}, "another result|random"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(change, says):
+    with pytest.raises(UsageError, match=says) as error:
+        seen(**change)
+    assert "\n" not in str(error.value)
+
+
+def test_a_controller_with_a_memory_is_refused():
+    calls = []
+
+    def counting(x):
+        calls.append(1)
+        return control(x) + (len(calls) > 40) * 0.1
+
+    with pytest.raises(UsageError, match="another result|not always do the same|differ"):
+        verdict(Inside({"angle": (-5.0, 5.0)}), observed=seen(c=counting))
+
+
+def test_a_kink_in_the_ode_and_times_beyond_the_horizon_are_refused():
+    kinked = seen(lambda x, u: torch.relu(x) + 0 * u)
+    with pytest.raises(UnsupportedOperationError, match="'relu' stands in the right-hand side of the ODE"):
+        verdict(Inside({"angle": (-5.0, 5.0)}), observed=kinked)
+    with pytest.raises(UsageError, match="speaks of 3 s, the horizon ends at 1.2 s"):
+        verdict(Inside({"angle": (-5.0, 5.0)}, when=(0.0, 3.0)))
+    with pytest.raises(UsageError, match="requirement 'relation'"):
+        verdict(Holds(lambda x: 3))
