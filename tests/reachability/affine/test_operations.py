@@ -398,3 +398,9 @@ def test_a_stored_limit_by_a_number_is_a_clamp(kind, order):
     assert [relaxed.name for relaxed in run.steps[0].relaxed] == ["clamp"]
     ends = [getattr(torch, kind)(side, limit[0]) for side in (start.lower, start.upper)]
     assert bool((run.tube.lower[1] <= ends[0]).all()) and bool((ends[1] <= run.tube.upper[1]).all())
+
+
+def test_what_underflows_is_still_enclosed():
+    for function in (lambda x, w: (x * 1e-200) * 1e-200, lambda x, w: (x / 1e200) / 1e200):
+        y = Formed(function, [1.0], [[0.5]])
+        assert float(y.low) <= 0.0 < float(y.high) and y.value.both[1].item() > 0.0

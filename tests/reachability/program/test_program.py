@@ -189,3 +189,11 @@ def test_limits_that_are_equal_for_equal_entries_make_one_entry():
     assert [i.size for i in program.instructions if i.kind == "clamp"] == [1]
     apart = record(lambda x, w: torch.clamp(x[:1].expand(3), max=torch.tensor([0.1, 0.2, 0.3])), X, X)
     torch.testing.assert_close(apart.run(X[None], X[None]).next[0], torch.tensor([0.1, 0.2, 0.3]).double())
+
+
+def test_a_value_takes_the_shape_of_another_one():
+    def step(x, w):
+        one, column = x[:1].expand_as(x), x.reshape(3, 1)
+        return one * x.view_as(w) + column.reshape_as(w) - column.expand_as(torch.zeros(3, 2)).sum(-1)
+
+    torch.testing.assert_close(record(step, X, X).run(X[None], X[None]).next[0], step(X, X))

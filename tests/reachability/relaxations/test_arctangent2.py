@@ -94,3 +94,15 @@ def test_a_point_and_an_infinite_box():
     assert float(band.radius) < 1e-13
     band, _, _ = relaxed(one, one, math.inf * one, one)
     assert math.pi <= float(band.radius) < 3.2 and float(band.slope) == 0
+
+
+@pytest.mark.parametrize("middle", [-2.0, 0.0, 2.0])
+@pytest.mark.parametrize("scale", [0.3, 1.0, 2.0])
+def test_the_product_of_what_is_across_and_what_is_along_is_between_its_bounds(middle, scale):
+    """X within 0.5 and Y within 0.3, independent of one another."""
+    most = torch.tensor(scale * 0.5 + 0.3 / scale, dtype=torch.float64)
+    v, radius = torch.tensor(middle, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
+    low, high = arctangent2.twist(v, radius, most, most)
+    exact = (abs(middle) + 0.5) * 0.3
+    assert float(low) <= -exact and exact <= float(high)
+    assert float(high - low) <= 2 * (abs(middle) * 0.3 + 0.25 * float(most) ** 2) + 1e-12

@@ -1,9 +1,11 @@
-"""The range of a leaky ReLU whose negative slope is negative too: V-shaped, not monotone."""
+"""A leaky ReLU: its range also where its negative slope is negative too, and its band where rounding matters."""
+
+from fractions import Fraction
 
 import pytest
 import torch
 
-from sagemp_cli.reachability.relaxations.leaky_relu import value_range
+from sagemp_cli.reachability.relaxations.leaky_relu import band, value_range
 
 
 @pytest.mark.parametrize("slope", [-2.0, -1.0, -0.1, 0.0, 0.1, 1.0])
@@ -23,3 +25,13 @@ def test_the_range_holds_every_value(slope):
 def test_what_is_not_negative_stays_so_exactly(slope):
     lower, upper = torch.tensor([0.0, 0.1, 2.0]).double(), torch.tensor([0.0, 1.0, 3.0]).double()
     assert torch.equal(value_range(lower, upper, slope)[0], lower)
+
+
+@pytest.mark.parametrize("slope", [0.1, 0.3, 0.7])
+@pytest.mark.parametrize(("low", "high"), [(-3e16, 0.7), (-0.7, 3e16), (-1e8, 1.1), (-1.1, 1e8), (-0.3, 0.7)])
+def test_a_band_holds_the_ends_and_the_kink_exactly_however_lopsided_it_is(slope, low, high):
+    found = band(torch.tensor([low], dtype=torch.float64), torch.tensor([high], dtype=torch.float64), slope)
+    tilt, offset, radius = (Fraction(float(part)) for part in found)
+    for x in (Fraction(low), Fraction(0), Fraction(high)):
+        value = x if x > 0 else Fraction(slope) * x
+        assert abs(value - tilt * x - offset) <= radius
