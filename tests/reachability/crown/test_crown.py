@@ -158,6 +158,17 @@ def test_chunks_of_rows_change_nothing():
     torch.testing.assert_close(whole.lower, chunks.lower, rtol=0, atol=1e-12)
 
 
+def test_bounds_of_deviations_become_bounds_of_values_rounded_outwards():
+    generator = torch.Generator().manual_seed(0)
+    sizes = 10.0 ** torch.randint(-6, 7, (3, 500), generator=generator).double()
+    center, low, high = sizes * (2 * torch.rand(3, 500, dtype=torch.float64, generator=generator) - 1)
+    lower, upper = crown_module._placed(center, low, high)
+    for c, a, b, least, most in zip(*(part.tolist() for part in (center, low, high, lower, upper)), strict=True):
+        assert Fraction(least) <= Fraction(c) + Fraction(a) and Fraction(c) + Fraction(b) <= Fraction(most)
+    torch.testing.assert_close(lower, center + low, rtol=1e-14, atol=1e-9)
+    torch.testing.assert_close(upper, center + high, rtol=1e-14, atol=1e-9)
+
+
 @pytest.mark.parametrize(("rows", "sweeps"), [(1, 10), (8, 10), (24, 4), (80, 1), (8192, 1)])
 def test_as_many_steps_go_back_in_one_sweep_as_the_rows_allow(rows, sweeps, monkeypatch):
     """Ten steps of four states, whose bounds are two rows each."""
