@@ -127,6 +127,10 @@ def test_a_tube_counts_as_it_is_until_it_explodes_and_as_the_widest_from_there(
     width[exploded] = 1e6
     cost = torch.log1p(width / 0.1)
     assert value.item() == pytest.approx((cost.mean() + 0.5 * cost[-1].mean()).item(), rel=1e-5)
+    # The same where only the last step has exploded.
+    first = int(exploded.nonzero()[0]) + 1
+    cut = loss_of(dataclasses.replace(loss, steps=first), tracker, unicycle, references[:1], start, disturbance)[0]
+    assert cut.item() == pytest.approx((cost[:first].mean() + 0.5 * cost[first - 1].mean()).item(), rel=1e-5)
 
 
 def test_a_wrong_share_is_refused():

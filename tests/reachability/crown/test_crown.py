@@ -76,6 +76,12 @@ def test_tilted_planes_contain_products_and_those_of_mccormick_are_among_them():
                 gain, _, m, p = head[0, :, 0].tolist()
                 excess = gain + m * difference + p * total - (upper - lower) * factor * y
                 assert float(excess.min()) > -1e-11
+                # Of all that is known of P and M it is as low as it can be: somewhere it touches.
+                grid = [np.linspace(-float(side), float(side), 101) for side in (plus, minus)]
+                whole, apart = (part.ravel() for part in np.meshgrid(*grid))
+                known = np.abs(whole) + np.abs(apart) <= 2 + 1e-9
+                over = gain + m * apart + p * whole - (upper - lower) * 0.25 * (whole**2 - apart**2)
+                assert -1e-8 < float(over[known].min()) < 2e-3
                 if correlation == 0 and abs(guess) == 2:
                     # McCormick's planes touch the product at three of the four corners.
                     assert int((excess[-4:].abs() < 1e-11).sum()) == 3

@@ -24,5 +24,5 @@ from sagemp_cli.reachability.relaxations.power import value_range
 )
 def test_a_range_is_rounded_outwards_but_not_across_0(lower, upper, exponent, expected):
     low, high = (float(s) for s in value_range(*torch.tensor([lower, upper], dtype=torch.float64), exponent))
-    assert low <= expected[0] and low == pytest.approx(expected[0], rel=1e-14)
-    assert high >= expected[1] and high == pytest.approx(expected[1], rel=1e-14)
+    assert low <= expected[0] and low == pytest.approx(expected[0], rel=1e-14, abs=0.0)
+    assert high >= expected[1] and high == pytest.approx(expected[1], rel=1e-14, abs=0.0)

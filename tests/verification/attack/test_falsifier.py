@@ -243,6 +243,22 @@ def test_what_only_touches_a_wall_is_not_the_step_at_which_it_is_broken():
     assert found is not None and not found.proved and (found.kind, found.step) == ("workspace", 1)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_state_that_misses_the_goal_is_the_one_that_does_at_the_end(side):
+    @dataclass(frozen=True)
+    class Jumps:
+        horizon: int = 2
+        state_dim: int = 2
+
+        def step(self, k: int, x: Tensor, w: Tensor) -> Tensor:
+            return x + side * torch.tensor([[4.0, 0.0], [-4.0, 0.5]][k], dtype=torch.float64) + w
+
+    still = torch.zeros(2, 2, dtype=torch.float64)
+    problem = claim(scene(goal=((-0.2, -0.2), (0.2, 0.2))), START, DISTURBANCE, 2)
+    found = replay(Jumps(), torch.zeros(2, dtype=torch.float64), still, problem)
+    assert found is not None and (found.kind, found.step, found.state) == ("goal", 2, 1)
+
+
 def test_an_overflowing_rollout_is_no_counterexample():
     @dataclass(frozen=True)
     class Explodes:
