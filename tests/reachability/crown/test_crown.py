@@ -21,6 +21,7 @@ from sagemp_cli.reachability.crown.steps import Steps
 from sagemp_cli.reachability.interval.interval import Interval
 from sagemp_cli.reachability.lirpa import adapter as lirpa_adapter
 from sagemp_cli.reachability.lirpa.auto_lirpa import AutoLirpa
+from sagemp_cli.reachability.program.loops import RecordedLoop, record
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import parallel
 from sagemp_cli.sets import Box
@@ -162,6 +163,23 @@ def test_chunks_of_rows_change_nothing():
     loop = unicycle_loop(line(0.3))
     whole, chunks = (Crown(rows=rows).propagate(loop, START, DISTURBANCE) for rows in (8192, 17))
     torch.testing.assert_close(whole.lower, chunks.lower, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("second", "shared"),
+    [
+        (torch.cos, [2]),
+        (lambda a: torch.cos(2 * a), [1, 1]),
+        (lambda a: torch.cos(a + torch.sin(a)), [2, 1]),  # both sines, but not the cosine of more
+    ],
+)
+def test_two_operations_that_follow_one_another_share_the_rows_of_one_input(second, shared):
+    x, none = torch.zeros(2, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+    program = record(lambda x, w: torch.cat([torch.sin(x[:1]), second(x[:1])]) + w, x, x)
+    start, w = Box.around([0.3, 0.0], [0.5, 0.1]), Box.around([0.0, 0.0], [0.01, 0.01])
+    steps = Steps(Affine().run(RecordedLoop((program,), none, 1), start, w, keep_steps=True).steps)
+    counts = [len(r.inputs.operations) for r in steps[0].replacements if r.inputs is not None]
+    assert counts == shared
 
 
 def test_bounds_of_deviations_become_bounds_of_values_rounded_outwards():
