@@ -66,6 +66,11 @@ SHIFT = gamma(2)
 """Of ``a - q b`` and of ``x + q``: a product and a sum."""
 
 
+ROUNDED = gamma(8)
+"""What is recorded of a product's band beyond ``half``: that and ``middle`` are a sum and a difference of squares,
+three roundings each, relative to the larger; beside that the smaller, near 0, may be lost in both."""
+
+
 def combined(terms: int) -> float:
     """Of a fixed combination of so many basic values, relative to the sum of all magnitudes.
 

@@ -17,6 +17,7 @@ from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.flow import AskedDivision
 from sagemp_cli.scenes.scene import scene_from_mapping
 from sagemp_cli.sets import Between, Box
 from sagemp_cli.storage import Certificate, Header, Tubes, write_artifact
@@ -107,10 +108,11 @@ def make_case(
     disc=None,
     limit=None,
     time="discrete",
+    order=None,
     **changes,
 ) -> Case:
     """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc;
-    ``limit`` is where the controls saturate.
+    ``limit`` is where the controls saturate; ``order`` is that of polynomials in continuous time.
     """
     config = config_of(robot, **changes)
     config["dynamics"]["time"] = time
@@ -132,7 +134,9 @@ def make_case(
     reference = problem.start.center + steps * velocity
     references = [reference] if not side else [reference, reference + torch.eye(n, dtype=torch.float64)[1] * side]
     verification = verify_references(
-        CellProver(propagator or Affine(), problem, tracker), torch.stack(references), counts=list(counts)
+        CellProver(propagator or Affine(), problem, tracker, division=AskedDivision(order=order)),
+        torch.stack(references),
+        counts=list(counts),
     )
     return Case(config, problem, tracker, arguments, tubes_record(verification))
 

@@ -69,6 +69,12 @@ def test_a_robot_under_a_tracker_is_proved_as_an_ode(robots):
     assert "reference 0" in dict(rows) and "8 periods of dt = 0.1 s" in dict(rows)["for"]
 
 
+def test_products_of_what_is_nearly_the_same_are_proved(tmp_path):
+    """Their bounds begin at 0 but for less than a rounding of what they end at."""
+    report = check(make_case(time="continuous", order=3).write(tmp_path / "certificate.h5"))
+    assert report.answer == "VERIFIED", (report.problems, report.findings)
+
+
 @pytest.mark.parametrize(
     ("change", "what"),
     [

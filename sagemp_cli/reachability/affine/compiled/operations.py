@@ -29,7 +29,7 @@ from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
-from sagemp_cli.sets.rounding import BAND, SAFETY, SHIFT, TINY, of_generators, of_product, over_symbols
+from sagemp_cli.sets.rounding import BAND, ROUNDED, SAFETY, SHIFT, TINY, of_generators, of_product, over_symbols
 from sagemp_cli.sets.zonotope import Zonotope
 
 Array = Any  # of numpy or of torch, which have no type in common: functions_of does the same to both
@@ -307,7 +307,7 @@ def _product(node: Node, frame: Frame, operands: Value) -> Value:
     center, coefficients = c * d + middle, c[..., None] * gy + d[..., None] * gx
     relaxed = Relaxed(
         "product",
-        Band(ratio, middle, half),
+        Band(ratio, middle, half * (1.0 + ROUNDED)),
         half * SAFETY + magnitude * (of_product(error) * SAFETY),
         frame.size,
         Value(m.stack([center, magnitude]), coefficients, error),
