@@ -75,6 +75,7 @@ def run(
             return
         certificate = verdict.read_certificate(context.output_path("verify"))
         again = verdict.rechecked(certificate)  # it may have been there already, and been changed since
+        draw_if_missing(context, wanted[proved - 1])
         code = verdict.exit_code(certificate)
         try:
             if code != EXIT_FALSIFIED:
@@ -102,7 +103,7 @@ def _make(context: StageContext, stages: Sequence[Stage], *, dry_run: bool, pref
             raise ArtifactError(f"{state.path}: {state.why}; move it away, 'sagemp run' does not replace it")
         if state.freshness is Freshness.FRESH:
             typer.echo(f"{prefix}{stage.name}: up to date ({state.path})")
-            if not dry_run:
+            if not dry_run and stage.name != "verify":  # a verdict is looked at before a figure is drawn of it
                 draw_if_missing(context, stage)
             continue
         experiment = state.header.experiment if state.header else context.config["name"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,14 @@ def run_stage(name: str, overrides: list[str], *, overwrite: bool, dry_run: bool
 
 
 def output_of(
-    name: str, overrides: list[str], *, overwrite: bool, dry_run: bool, seconds: float | None, shown: str = ""
+    name: str,
+    overrides: list[str],
+    *,
+    overwrite: bool,
+    dry_run: bool,
+    seconds: float | None,
+    shown: str = "",
+    first: Callable[[Path], object] = lambda path: None,
 ) -> tuple[Path, bool] | None:
     """The path of a stage's output, and whether it was there already; None if the stage is not to run.
 
@@ -50,6 +58,7 @@ def output_of(
         dry_run: only say what would be done.
         seconds: time limit.
         shown: what the command prints of an output that is up to date; without it such an output is in the way.
+        first: looks at such an output before a figure is drawn of it, and raises if it is not what it says.
     """
     from sagemp_cli.pipeline.freshness import Freshness, survey
     from sagemp_cli.pipeline.stage import stage_named
@@ -74,6 +83,7 @@ def output_of(
     with time_limit(seconds):
         if not known:
             return state.stage.run(context), known
+        first(state.path)
         draw_if_missing(context, state.stage)
         return state.path, known
 

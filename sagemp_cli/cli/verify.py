@@ -39,12 +39,21 @@ def verify(
     from sagemp_cli.cli import verdict
 
     given = overrides_of(overrides, seed=seed, seed_of="verify", partitions=partitions)
-    made = output_of("verify", given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit, shown="the verdict")
+    rechecks: list[str] = []
+    made = output_of(
+        "verify",
+        given,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        seconds=time_limit,
+        shown="the verdict",
+        first=lambda path: rechecks.append(verdict.rechecked(verdict.read_certificate(path))),
+    )
     if made is None:
         return
     path, known = made
     certificate = verdict.read_certificate(path)
-    again = verdict.rechecked(certificate) if known else None
+    again = rechecks[0] if known else None
     if as_json:
         typer.echo(json.dumps(verdict.as_json(certificate) | {"from_file": known, "rechecked": again}, indent=2))
     else:

@@ -55,3 +55,16 @@ def test_what_a_terminal_would_obey_is_not_printed(sagemp, toy_folder, tmp_path)
     for command in ("check", "inspect"):
         result = sagemp(command, path)
         assert "VERIFIED" in result.output and "\x1b" not in result.output
+
+
+@pytest.mark.parametrize("command", [("verify",), ("run", "--until", "verify")], ids=lambda c: c[0])
+def test_no_figure_is_drawn_of_a_verdict_that_is_refused(command, sagemp, toy_folder, tmp_path):
+    shutil.copytree(toy_folder, tmp_path / "artifacts" / toy_folder.name)
+    path = tmp_path / "artifacts" / toy_folder.name / "certificate.h5"
+    with h5py.File(path, "r+") as file:
+        file["data/tubes/step"][...] = 3
+        file.attrs["content_sha256"] = content_hash(file)
+    path.with_suffix(".png").unlink(missing_ok=True)
+    result = sagemp(*command, "effort=toy")
+    assert result.exit_code == 2 and "is called SAFE, but a step" in result.stderr
+    assert not path.with_suffix(".png").exists() and "figure" not in result.output
