@@ -17,7 +17,7 @@ from sagemp_cli.reachability.flow import Division
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.sets import Box
 
-ENOUGH = 0.02
+ENOUGH = 0.04
 """Share of the tube's width that the remainders of a period may have, to begin with."""
 
 FINE = 0.002
@@ -37,15 +37,19 @@ FLOOR = 0.01
 def remainder_share(reach: Reach, floor: float = 0.0) -> Tensor:
     """Of each cell, widths of the remainders of a period beside those of the tube, of the worst state; ``(C,)``.
 
-    Averages over all periods; infinite where the tube is not bounded. A width counts as at least ``floor`` times that
-    of a box around the whole tube.
+    The median over the periods that have an enclosure, so that where a tube explodes in the end, what it did before
+    counts; infinite where there is none. A width counts as at least ``floor`` times how far the tube goes.
     """
     flow = reach.flow
     assert flow is not None
-    left_out = (flow.remainder_upper - flow.remainder_lower).sum(2).mean(1)
-    around = reach.tube.upper.amax(1) - reach.tube.lower.amin(1)
-    share = left_out / torch.maximum(reach.tube.width[:, 1:].mean(1), floor * around)
-    return torch.nan_to_num(torch.where(left_out == 0, 0.0, share), nan=torch.inf).amax(-1)
+    left_out = (flow.remainder_upper - flow.remainder_lower).sum(2)
+    lower, upper = reach.tube.lower[:, 1:], reach.tube.upper[:, 1:]
+    known = torch.isfinite(left_out) & torch.isfinite(lower) & torch.isfinite(upper)
+    top, bottom = torch.where(known, upper, -torch.inf).amax(1), torch.where(known, lower, torch.inf).amin(1)
+    width = torch.maximum(upper - lower, floor * (top - bottom)[:, None])
+    share = torch.where(left_out == 0, 0.0, left_out / width)
+    share = torch.where(known, share, torch.nan).nanmedian(1).values
+    return torch.nan_to_num(share, nan=torch.inf).amax(-1)
 
 
 ORDERS = (2, 3)

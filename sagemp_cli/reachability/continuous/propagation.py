@@ -76,7 +76,8 @@ class _Block:
         """Whether another guess is of no use, ``(C, K)``."""
         tube = self.run.tube
         bounded = torch.isfinite(tube.lower[:, :-1]).all(-1) & torch.isfinite(tube.upper[:, :-1]).all(-1)
-        return self.holds | ~bounded
+        found = torch.isfinite(self.needed).all(0).flatten(2).all(-1)  # larger remainders only make larger sets
+        return self.holds | ~bounded | ~found
 
     def widened(self) -> Tensor:
         """The next guess, ``(2, K, C, S, n)``."""

@@ -86,10 +86,12 @@ def judged(reach: Reach, asked: Sequence[Asked], loop: SampledLoop, w: Box) -> J
     flow = reach.flow
     assert flow is not None
     cells, controls = len(flow.lower), _controls(reach, loop, len(flow.lower))
-    bounded = torch.isfinite(reach.tube.lower).all(-1) & torch.isfinite(reach.tube.upper).all(-1)
-    bounded = bounded.all(-1) & torch.isfinite(flow.lower).flatten(1).all(-1)
-    bounded &= torch.isfinite(flow.upper).flatten(1).all(-1)
-    missing = (~bounded).double() * _HUGE
+    known = torch.isfinite(reach.tube.lower[:, 1:]) & torch.isfinite(reach.tube.upper[:, 1:])
+    known &= (torch.isfinite(flow.lower) & torch.isfinite(flow.upper)).all(2)
+    start = torch.isfinite(reach.tube.lower[:, 0]) & torch.isfinite(reach.tube.upper[:, 0])
+    lost_periods = (~known.all(-1)).double().mean(1)
+    bounded = (lost_periods == 0) & start.all(-1)
+    missing = math.log1p(_HUGE) * lost_periods  # so many as there are, so that fewer are better
     rows = []
     h = loop.period / flow.division.substeps
     for one in asked:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.any_loop import cells_of
-from sagemp_cli.reachability.continuous.division import FINE, finer, remainder_share, suggested
+from sagemp_cli.reachability.continuous.division import ENOUGH, FINE, finer, remainder_share, suggested
 from sagemp_cli.reachability.continuous.observed import ObservedOde
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
@@ -269,13 +269,14 @@ class _Work:
             halves = self.halved(piece, division)
             if halves is None:
                 break
-            piece = halves
+            piece, refines = halves, True
             vain = vain + 1 if float(piece.judgement.missing.sum()) > 2 * (1 - _GAIN) * before else 0
         return [p for p in (*done, piece) if len(p.cells.lower)]
 
     def coarse(self, reach: Reach) -> bool:
-        """Whether more parts would help."""
-        return bool((remainder_share(reach) > FINE).any())
+        """Whether more parts would help: a tube that explodes does so for other reasons if remainders are small."""
+        bounded = bool(torch.isfinite(reach.tube.upper).all() & torch.isfinite(reach.tube.lower).all())
+        return bool((remainder_share(reach) > (FINE if bounded else ENOUGH)).any())
 
     def piece(self, cells: Box, division: Division) -> Piece:
         """Cells bounded and judged."""
