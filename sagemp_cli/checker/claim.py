@@ -46,9 +46,7 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     ]
     tubes = document.tubes
     safe_ones = [r for r, v in enumerate(tubes["verdict"]) if v == "SAFE"] or list(range(len(tubes["verdict"])))
-    rows.append(
-        ("proves", _aims(safe, "x_k stays in its tube" if document.ode is None else "x(k dt) stays in its tube"))
-    )
+    rows.append(("proves", _aims(safe, *(("x_k", "x_K") if document.ode is None else ("x(k dt)", "x(K dt)")))))
     if safe.workspace is not None:
         places = [names[i] for i in document.position], [units[i] for i in document.position]
         rows.append(("workspace", _box(*safe.workspace, *places)))
@@ -192,13 +190,13 @@ def _obstacle(obstacle: tuple[str, str, list[float], Any]) -> str:
     return f"{name}: block from ({place}) to ({', '.join(f'{v:.6g}' for v in second)})"
 
 
-def _aims(safe: SafeSet, first: str) -> str:
+def _aims(safe: SafeSet, first: str, last: str) -> str:
     """What a verdict of SAFE says."""
-    parts = [first]
+    parts = [f"{first} stays in its tube"]
     if safe.workspace is not None:
         parts.append("in the workspace")
     parts.append(f"clear of {len(safe.obstacles)} obstacles" if safe.obstacles else "no obstacle is claimed")
-    parts.append("x_K is in the goal" if safe.goal is not None else "no goal is claimed")
+    parts.append(f"{last} is in the goal" if safe.goal is not None else "no goal is claimed")
     return ", ".join(parts)
 
 

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from sagemp_cli.checker.balls import arb, ball, balls, ctx
-from sagemp_cli.checker.between import SEGMENTS, on_line
+from sagemp_cli.checker.between import SAMPLES, on_line
 from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.points import Point, outputs_at
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet
+from sagemp_cli.checker.solution import followed
 from sagemp_cli.checker.unproved import Unproved
 
 BITS = 512  # a rollout has no other errors than rounding, which the loop may amplify
@@ -44,7 +45,8 @@ def replay(
 def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[Ends, Ends], safe: SafeSet) -> str:
     """Prove that a rollout from X_I under disturbances in W leaves the safe set or misses the goal.
 
-    It does so at its step, or at the fraction of it that the record says, on the straight line to the next sample.
+    It does so at its step, or at the fraction of it that the record says, on the straight line to the next sample; in
+    continuous time as a solution under a disturbance that is constant on every period.
 
     The start and the disturbances are taken from the record as exact numbers, nothing else is. The boxes stored beside
     the tubes may be larger than X_I and W: from there everything is moved into the nearest point of those.
@@ -70,16 +72,17 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
             raise Unproved("its disturbances are not in W")
         if not 0 <= step <= last:
             raise Unproved(f"its step {step} is none of the horizon {last}")
-        if document.ode is not None and (step or fraction):
-            raise Unproved("it is a solution of an ODE, which is not followed here")
-        if not (fraction == 0 or (0 < fraction < 1 and step < last and document.between == SEGMENTS)):
+        if not (fraction == 0 or (0 < fraction < 1 and step < last and document.between != SAMPLES)):
             raise Unproved(f"its time, {fraction:.6g} of step {step} over, is none that the claim speaks of")
         with ctx.workprec(BITS):
             programs = [document.programs[i] for i in document.step_program]
             rows = disturbances[: step + (fraction > 0)]
             x0, w = _moved(first, sets[0]), [_moved(row, sets[1]) for row in rows]
-            x = replay(programs, x0, w, document.windows(r))
-            now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
+            if document.ode is not None:
+                now = followed(document.ode, document.programs[0], x0, w, document.windows(r), fraction)
+            else:
+                x = replay(programs, x0, w, document.windows(r))
+                now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
             if _violates(now, document.position, safe, at_end=step == last):
                 return ""
             raise Unproved(f"its replay violates nothing for certain at step {step + fraction:.10g}")

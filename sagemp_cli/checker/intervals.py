@@ -118,7 +118,8 @@ def _result(i: Instruction, reads: Sequence[Column]) -> Column:
 # -- pairs -------------------------------------------------------------------------------------------------------------
 
 
-def _add(a: Interval, b: Interval) -> Interval:
+def add(a: Interval, b: Interval) -> Interval:
+    """The sum."""
     if a is NOTHING:
         return b
     return a if b is NOTHING else (a[0] + b[0], a[1] + b[1])
@@ -128,7 +129,8 @@ def _sub(a: Interval, b: Interval) -> Interval:
     return a if b is NOTHING else (a[0] - b[1], a[1] - b[0])
 
 
-def _mul(a: Interval, b: Interval) -> Interval:
+def mul(a: Interval, b: Interval) -> Interval:
+    """The product of two values that have nothing to do with each other."""
     if a is NOTHING or b is NOTHING:
         return NOTHING
     low, high = a
@@ -153,7 +155,7 @@ def _mul(a: Interval, b: Interval) -> Interval:
 
 
 def _div(a: Interval, b: Interval) -> Interval:
-    return _mul(a, _reciprocal(b))
+    return mul(a, _reciprocal(b))
 
 
 def _atan2(y: Interval, x: Interval) -> Interval:
@@ -168,9 +170,9 @@ def _atan2(y: Interval, x: Interval) -> Interval:
 
 
 _PAIRS: Mapping[str, Callable[[Interval, Interval], Interval]] = {
-    "add": _add,
+    "add": add,
     "sub": _sub,
-    "mul": _mul,
+    "mul": mul,
     "div": _div,
     "atan2": _atan2,
 }

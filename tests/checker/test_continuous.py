@@ -16,6 +16,7 @@ from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.against import differences
+from sagemp_cli.storage import Counterexample, Header, write_artifact
 
 from .conftest import constants_of, make_case
 from .continuous import FlowCase, flow_case
@@ -208,6 +209,53 @@ def test_no_switching_signal_leaves_the_checkers_own_sets(case, path):
             d = rate(x + h / 2 * b)
             x = x + h / 6 * (a + 2 * b + 2 * d + rate(x + h * d))
         assert (at[-1][:, 0] - slack <= x.numpy()).all() and (x.numpy() <= at[-1][:, 1] + slack).all()
+
+
+def falsified(case, path, *, center, step, fraction, start=(0.05, 0.15, 0.0), w=(0.02, -0.1, 0.1)):
+    """A certificate that says a solution under a constant signal is in the disc at some time."""
+    config = copy.deepcopy(case.config)
+    config["scene"]["obstacles"][0].update(center=center, radius=0.01)
+    tubes = dataclasses.replace(
+        case.certificate.tubes,
+        verdict=("UNSAFE",),
+        step=np.array([step]),
+        fraction=np.array([fraction]),
+        constraint=("disc",),
+    )
+    states = np.zeros((case.loop.horizon + 1, 3))
+    states[0] = start
+    example = Counterexample(
+        reference=0, kind="collision", step=step, fraction=fraction, constraint="disc", depth=0.01, states=states,
+        disturbances=np.tile(w, (case.loop.horizon, 1)),
+    )  # fmt: skip
+    made = dataclasses.replace(case.certificate, tubes=tubes, counterexamples=(example,), verdict="FALSIFIED")
+    header = Header(stage="prove", experiment="vehicle", config=config)
+    return write_artifact(path, made, header, overwrite=True)
+
+
+def simulated(loop, start, w, until, fine=4096):
+    """Where a solution under a constant signal is at some time."""
+    x, w = (torch.tensor([v], dtype=torch.float64) for v in (start, w))
+    h = loop.period / fine
+    u = x[:, :1]
+    for i in range(round(until / h)):
+        u = loop.control_given(None, x) if i % fine == 0 else u
+        a = loop.rate(x, u) + w
+        x = x + h * (loop.rate(x + h / 2 * a, u) + w)
+    return x[0].tolist()
+
+
+def test_a_solution_that_is_in_an_obstacle_between_two_instants_is_proved_to_be(case, mutate, tmp_path):
+    at = simulated(case.loop, (0.05, 0.15, 0.0), (0.02, -0.1, 0.1), 2.625 * case.loop.period)
+    path = falsified(case, tmp_path / "certificate.h5", center=at[:2], step=2, fraction=0.625)
+    report = check(path)
+    assert report.answer == "FALSIFIED" and report.counterexamples == ((0, ""),)
+    for step, fraction in ((2, 0.5), (2, 0.75), (1, 0.625), (3, 0.0), (0, 0.0), (2, 1.5), (2, np.nan), (4, 0.5)):
+
+        def change(file, step=step, fraction=fraction):
+            file["data/counterexamples/000000"].attrs.update(step=step, fraction=fraction)
+
+        assert check(mutate(path, tmp_path / "mutant.h5", change)).answer == "UNKNOWN", (step, fraction)
 
 
 def put(name, index, value):

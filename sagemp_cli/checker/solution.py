@@ -1,0 +1,111 @@
+"""One solution of an ODE under a disturbance that is constant on every period, followed in intervals.
+
+There is one start and one signal, so a box around the solution is as narrow as the arithmetic and the remainder of a
+Taylor polynomial of a high degree let it be; the loop widens it from period to period, and many digits are kept for
+that. Where it becomes too wide, nothing is proved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sagemp_cli.checker.balls import arb, ball, balls
+from sagemp_cli.checker.intervals import Bounds, Column, add, mul, point, points
+from sagemp_cli.checker.ode import Flow
+from sagemp_cli.checker.points import Point, outputs_at
+from sagemp_cli.checker.program import Program
+from sagemp_cli.checker.taylor import solution
+from sagemp_cli.checker.unproved import Unproved
+from sagemp_cli.checker.writing import Writer
+
+ORDER, PARTS = 14, 16
+"""Degree of the polynomials, and parts of a period."""
+_ROUNDS = 20
+
+
+def followed(
+    ode: Flow, control: Program, start: Point, signal: Sequence[Point], windows: np.ndarray, fraction: float
+) -> Point:
+    """A box around the state after the periods of a signal, of the last of which only a fraction passes if it is not 0.
+
+    Args:
+        ode: the loop's flow.
+        control: its control.
+        start: x(0).
+        signal: w on each period.
+        windows: numbers of the control, ``(K, g)``.
+        fraction: in [0, 1).
+
+    Raises:
+        Unproved: no box was found that the solution stays in, or it is too wide.
+    """
+    try:
+        follower = _Follower(ode)
+    except ValueError as e:
+        raise Unproved(str(e)) from None
+    x = list(start)
+    for k, w in enumerate(signal):
+        numbers = []
+        if ode.controls:
+            inputs = {"state": x, "disturbance": w, "numbers": balls(windows[k])}
+            numbers = [(u.lower(), u.upper()) for u in outputs_at(control, inputs)["control"]]
+        whole = k < len(signal) - 1 or not fraction
+        box = [(v.lower(), v.upper()) for v in x]
+        passed = PARTS if whole else int(fraction * PARTS)  # exact: a multiple by a power of two
+        for _ in range(passed):
+            box = follower.after(box, numbers, points(w), follower.length)
+        if not whole:
+            rest = ball(fraction) * follower.length * PARTS - follower.length * passed
+            box = follower.after(box, numbers, points(w), rest)
+        x = [low.union(high) for low, high in box]
+        if not all(v.is_finite() for v in x):
+            raise Unproved(f"its solution cannot be followed through period {k}: the box around it becomes too wide")
+    return x
+
+
+class _Follower:
+    """Steps of at most ``length`` seconds."""
+
+    def __init__(self, ode: Flow) -> None:
+        n = ode.rate.states
+        out = Writer(n, n, ode.rate.numbers)
+        c = solution(out, ode.rate, out.state, out.numbers, out.disturbance, ORDER + 1)
+        zeros = out.constant([0.0] * n)
+        made = out.finished(
+            {"next": out.state, "control": out.join([zeros if v is None else v for v in c[1:]])}
+        )  # fmt: skip
+        self._n, self._rate = n, Bounds(ode.rate, ode.rate.next)
+        self._coefficients = Bounds(made, made.control)
+        self.length = ball(ode.length) * ode.substeps / PARTS
+
+    def after(self, box: Column, numbers: Column, w: Column, time: arb) -> Column:
+        """A box around the state some time later, at most a step."""
+        inside = self._stay(box, numbers, w)
+        given = {"disturbance": [w], "numbers": [numbers]}
+        (at,), (over,) = (self._coefficients.of({"state": [x], **given}) for x in (box, inside))
+        total = over[-self._n :]  # of degree p + 1, over all that the solution may be at
+        for q in range(ORDER - 1, -1, -1):
+            own = at[q * self._n : (q + 1) * self._n]
+            total = [add(c, mul(t, point(time))) for c, t in zip(own, total, strict=True)]
+        return [add(x, mul(t, point(time))) for x, t in zip(box, total, strict=True)]
+
+    def _stay(self, box: Column, numbers: Column, w: Column) -> Column:
+        """A box that the solution stays in over a step: it holds what comes out of it."""
+        trial = self._image(box, box, numbers, w)
+        for _ in range(_ROUNDS):
+            wider = [(a - (b - a) / 8, b + (b - a) / 8) for a, b in trial]
+            found = self._image(box, wider, numbers, w)
+            if all(a <= c and d <= b for (a, b), (c, d) in zip(wider, found, strict=True)):
+                return found
+            trial = [(a.min(c), b.max(d)) for (a, b), (c, d) in zip(trial, found, strict=True)]
+        raise Unproved("no box was found that the solution stays in")
+
+    def _image(self, box: Column, stay: Column, numbers: Column, w: Column) -> Column:
+        (rates,) = self._rate.of({"state": [stay], "numbers": [numbers]})
+        slopes = [add(r, v) for r, v in zip(rates, w, strict=True)]
+        return [
+            (a + self.length * low.min(arb(0)), b + self.length * high.max(arb(0)))
+            for (a, b), (low, high) in zip(box, slopes, strict=True)
+        ]
