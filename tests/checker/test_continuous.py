@@ -16,7 +16,12 @@ from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.zonotope import Zonotope
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.pipeline.against import differences
+from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.storage import Counterexample, Header, write_artifact
+from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
+from sagemp_cli.verification.cells import CellProver
+from sagemp_cli.verification.verification import verify_references
 
 from .conftest import constants_of, make_case
 from .continuous import FlowCase, flow_case
@@ -256,6 +261,25 @@ def test_a_solution_that_is_in_an_obstacle_between_two_instants_is_proved_to_be(
             file["data/counterexamples/000000"].attrs.update(step=step, fraction=fraction)
 
         assert check(mutate(path, tmp_path / "mutant.h5", change)).answer == "UNKNOWN", (step, fraction)
+
+
+def test_what_the_attack_refutes_the_checker_refutes(tmp_path):
+    made = make_case(time="continuous", disc=[0.4, 0.45])
+    found = verify_references(
+        CellProver(Affine(), made.problem, made.tracker), torch.from_numpy(made.tubes.references), counts=[2, 1]
+    )
+    refuted = attack(
+        found, made.problem, tracker=made.tracker, generator=torch.Generator().manual_seed(0),
+        options=FalsifierOptions(restarts=4),
+    )  # fmt: skip
+    ((r, example),) = refuted.counterexamples
+    examples = (counterexample_record(r, example, "disc"),)
+    path = made.write(
+        tmp_path / "certificate.h5", tubes=tubes_record(refuted.verification), verdict="FALSIFIED",
+        counterexamples=examples,
+    )  # fmt: skip
+    report = check(path)
+    assert report.answer == "FALSIFIED" and report.counterexamples == ((0, ""),)
 
 
 def put(name, index, value):
