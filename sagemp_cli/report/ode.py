@@ -61,8 +61,8 @@ def draw_ode(
             time = np.arange(low.shape[1] + 1) * proof.loop.period / flow.division.substeps
             for bottom, top in zip(low, high, strict=True):
                 known = np.isfinite(bottom) & np.isfinite(top)
-                sides = [np.append(np.where(known, side, np.nan), np.nan) for side in (bottom, top)]
-                axes.fill_between(time, *sides, step="post", color=MODES[0], alpha=0.35, linewidth=0)
+                lower, upper = (np.append(np.where(known, side, np.nan), np.nan) for side in (bottom, top))
+                axes.fill_between(time, lower, upper, step="post", color=MODES[0], alpha=0.35, linewidth=0)
         if proof.violation is not None:
             states = proof.violation.states[:, i].numpy()
             axes.plot(proof.violation.times.numpy(), states, color=DANGER, linewidth=1.2)

@@ -71,6 +71,7 @@ def observable(function: Callable[[Any], Any], loop: SampledLoop, example: Tenso
     except UsageError as e:
         raise UsageError(f"requirement '{name}': {e}") from None
     assert value.outputs.control is not None
+    _same(function, value, example, name)
     size = value.instructions[value.outputs.control].size
     out = Writer(n, n, loop.controls)
     try:
@@ -83,6 +84,21 @@ def observable(function: Callable[[Any], Any], loop: SampledLoop, example: Tenso
     zeros = out.constant([0.0] * size)
     change = out.finished(next=out.state, control=out.join(*(zeros if slot is None else slot for slot in found)))
     return Observable(value, change, size)
+
+
+@torch.no_grad()
+def _same(function: Callable[[Any], Any], value: Program, example: Tensor, name: str) -> None:
+    """Refuse a function that does something else than its program at states around the example, or the second time."""
+    for i in range(8):
+        x = example + i * 0.1 * (1 + example.abs()) * torch.cos(torch.arange(len(example)) * (i + 1.0))
+        recorded = value.run(x, torch.zeros_like(x)).control
+        given = function(x).reshape(-1).to(torch.float64)
+        both = torch.isfinite(given) & torch.isfinite(recorded)
+        if not bool(((given - recorded).abs() <= 1e-9 * (1 + given.abs()))[both].all()):
+            raise UsageError(
+                f"requirement '{name}' does not always do the same: at x = {x.tolist()} it gives {given.tolist()}, "
+                f"recorded {recorded.tolist()}; it must be a function of x only, in torch operations"
+            )
 
 
 @torch.no_grad()

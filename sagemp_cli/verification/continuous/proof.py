@@ -182,6 +182,7 @@ def verify_ode(
     """
     began = time.process_time()
     example = seen.start.center
+    formulas = _named(formulas)
     asked = [Asked.of(f, seen.loop, example) for f in formulas]
     violation = None
     if restarts:
@@ -220,6 +221,16 @@ def verify_ode(
         notes,
         propagator.name,
     )
+
+
+def _named(formulas: Sequence[Formula]) -> list[Formula]:
+    """The same with names of their own: the second ``inside`` is ``inside 2``."""
+    seen: dict[str, int] = {}
+    found = []
+    for formula in formulas:
+        seen[formula.name] = count = seen.get(formula.name, 0) + 1
+        found.append(formula if count == 1 else replace(formula, name=f"{formula.name} {count}"))
+    return found
 
 
 class _Work:

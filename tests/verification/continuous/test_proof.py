@@ -62,6 +62,10 @@ def test_what_is_false_is_refuted_by_an_enclosure_of_the_solution():
     assert proof.answer is Answer.FALSIFIED
     broken = proof.violation
     assert broken.proved and broken.requirement == "inside" and broken.depth > 0
+    assert [(v.name, v.answer) for v in proof.verdicts] == [
+        ("inside", Answer.FALSIFIED),
+        ("inside 2", Answer.UNKNOWN),  # which was not tried
+    ]
     assert bool(((START.lower <= broken.start) & (broken.start <= START.upper)).all())
 
 
@@ -157,3 +161,14 @@ def test_a_kink_in_the_ode_and_times_beyond_the_horizon_are_refused():
         verdict(Inside({"angle": (-5.0, 5.0)}, when=(0.0, 3.0)))
     with pytest.raises(UsageError, match="requirement 'relation'"):
         verdict(Holds(lambda x: 3))
+
+
+def test_a_requirement_that_is_no_function_of_the_state_is_refused():
+    calls = []
+
+    def shrinking(x):
+        calls.append(1)
+        return 5.0 - len(calls) * 0.1 - x[..., :1]
+
+    with pytest.raises(UsageError, match="requirement 'relation' does not always do the same"):
+        verdict(Holds(shrinking))
