@@ -26,9 +26,9 @@ def read_certificate(path: Path) -> Artifact[Certificate]:
         raise ArtifactError(
             f"{path}: /data/verdict is '{artifact.record.verdict}', known are {', '.join(ANSWER_CODES)}"
         )
-    if artifact.record.tubes.between not in ("segments", "samples"):
+    if artifact.record.tubes.between not in ("segments", "continuous", "samples"):
         raise ArtifactError(
-            f"{path}: /data/tubes/between is '{artifact.record.tubes.between}'; known: segments, samples"
+            f"{path}: /data/tubes/between is '{artifact.record.tubes.between}'; known: segments, continuous, samples"
         )
     return artifact
 

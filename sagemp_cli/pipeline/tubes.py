@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from sagemp_cli.errors import ArtifactError
-from sagemp_cli.reachability.flow import Flow
+from sagemp_cli.reachability.flow import Division, Flow
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import PARTS, Between, Box, Tube
 from sagemp_cli.storage import Counterexample, FlowBounds, Relaxations, Tubes
@@ -45,6 +45,16 @@ def tubes_record(v: Verification) -> Tubes:
         relaxations=None if v.recording is None else relaxations_record(v.recording),
         flow=None if v.flow is None else flow_record(v.flow),
     )
+
+
+def flow_of(record: FlowBounds, tube: Tube) -> Flow:
+    """What is stored of the time between the instants, with the tube ``(C, K+1, n)`` at them."""
+    ends = [
+        torch.cat([side[:, :-1, None], torch.from_numpy(inner)], 2)
+        for side, inner in ((tube.lower, record.inner_lower), (tube.upper, record.inner_upper))
+    ]
+    sides = (record.lower, record.upper, record.remainder_lower, record.remainder_upper, record.curve, record.drift)
+    return Flow(Division(record.substeps, record.order), *ends, *map(torch.from_numpy, sides))
 
 
 def flow_record(flow: Flow) -> FlowBounds:

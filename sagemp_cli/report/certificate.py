@@ -13,6 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.pipeline.problem import problem_of
+from sagemp_cli.pipeline.tubes import flow_of
 from sagemp_cli.problem import Problem
 from sagemp_cli.report.canvas import (
     DANGER,
@@ -39,12 +40,12 @@ from sagemp_cli.report.canvas import (
     tube_boxes,
 )
 from sagemp_cli.report.space import space_axes, space_tube
-from sagemp_cli.sets import Between, Box, Tube, over_steps
+from sagemp_cli.sets import Between, Box, Bulge, Tube, over_steps
 from sagemp_cli.sets.between import moment
 from sagemp_cli.storage import Artifact, Certificate, Tubes
 
 _SAYS = {
-    "VERIFIED": "Certified over the whole of every step: every start in X$_I$ stays clear and reaches the goal",
+    "VERIFIED": "Certified {when}: every start in X$_I$ stays clear and reaches the goal",
     "FALSIFIED": "Falsified: a replayed counterexample breaks the claim",
     "UNKNOWN": "Unknown: the tube does not prove it, and no counterexample was found",
 }
@@ -110,7 +111,7 @@ def draw_certificate(artifact: Artifact[Certificate]) -> Figure:
     proof = "rounding included" if tubes.rigorous else "sound in exact arithmetic"
     headline(
         figure,
-        f"{_SAYS.get(record.verdict, record.verdict)}",
+        _SAYS.get(record.verdict, record.verdict).format(when=Between(tubes.between).words),
         f"{subject(artifact.header)}: {_deciding(tubes, dynamics.dt)}; {count} reference{'s' * (count > 1)}, "
         f"{cells} cell{'s' * (cells > 1)}, K = {horizon} ({horizon * dynamics.dt:g} s), "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s, {proof}; "
@@ -162,11 +163,16 @@ def _band(axes: Axes, times: np.ndarray, problem: Problem, tubes: Tubes, referen
 def _clearances(axes: Axes, times: np.ndarray, problem: Problem, tubes: Tubes) -> None:
     """Certified distance of the tubes to every constraint over each step; not above the red line nothing is proved."""
     index = list(problem.dynamics.position)
-    lower, upper = tubes.tube_lower[..., index], tubes.tube_upper[..., index]
-    lower = np.nan_to_num(lower, nan=-np.inf, posinf=-np.inf)
-    upper = np.nan_to_num(upper, nan=np.inf, neginf=np.inf)
-    parts = over_steps(Tube(torch.from_numpy(lower), torch.from_numpy(upper)))
-    found = problem.scene.clearances(Box(parts.lower, parts.upper)).amin((0, 2)).numpy()
+    tube = Tube(torch.from_numpy(tubes.tube_lower), torch.from_numpy(tubes.tube_upper))
+    lines, bulge, steps = tube, None, tube.horizon
+    if tubes.flow is not None:
+        lines, bulge = flow_of(tubes.flow, tube).lines(tube, problem.disturbance, problem.dynamics.dt)
+        bulge = Bulge(*(part[..., index] for part in (bulge.curve, bulge.swing, bulge.rest)))
+    lower = torch.nan_to_num(lines.lower[..., index], nan=-torch.inf, posinf=-torch.inf)
+    upper = torch.nan_to_num(lines.upper[..., index], nan=torch.inf, neginf=torch.inf)
+    parts = over_steps(Tube(lower, upper), bulge)
+    least = problem.scene.clearances(Box(parts.lower, parts.upper)).amin((0, 2))
+    found = least.unflatten(0, (steps, -1)).amin(1).numpy()
     style_axes(axes, xlabel="time (s)", ylabel="clearance (m)")
     names = list(tubes.constraint_names)
     if len(names) > 4:  # too many lines to tell apart

@@ -26,6 +26,7 @@ from sagemp_cli.report.canvas import (
     style_axes,
     subject,
 )
+from sagemp_cli.sets import Between
 from sagemp_cli.storage import Artifact, Library
 
 
@@ -80,7 +81,7 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         f"{subject(artifact.header)}: {record.sampled} references sampled, "
         f"{len(tubes.cell_reference) // count} cells each, K = {horizon}, "
         f"{tubes.propagator} in {tubes.seconds.sum():.2g} s; "
-        f"certified clearance at least {tubes.clearance.min():.2f} m over the whole of every step",
+        f"certified clearance at least {tubes.clearance.min():.2f} m {Between(tubes.between).words}",
         colour=SAFE if count >= record.wanted else INK,
     )
     return figure

@@ -27,6 +27,7 @@ from sagemp_cli.report.canvas import (
     style_axes,
     subject,
 )
+from sagemp_cli.sets import Between
 from sagemp_cli.storage import Artifact, Library, Rollouts
 
 DRAWN = 600
@@ -98,7 +99,7 @@ def draw_rollouts(artifact: Artifact[Rollouts], library: Artifact[Library]) -> F
         f"{subject(artifact.header)}: {len(record.chosen)} starts measured in X$_I$, closest of "
         f"{len(tubes.verdict)} certified references tracked (mean E = {record.reference_error.mean():.3g}); "
         "random and worst-case disturbances; "
-        f"{safe} of {total} kept clear over the whole of every step and reached the goal",
+        f"{safe} of {total} kept clear {Between(tubes.between).words} and reached the goal",
         colour=SAFE if inside == total else DANGER,
     )
     return figure

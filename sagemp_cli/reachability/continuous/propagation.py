@@ -31,6 +31,8 @@ _FIRST, _LONGEST = 4, 32
 """Periods that are propagated at a time, at first and at most."""
 _MARGIN = 0.05
 """Share of its width that a guess is wider than what it was made from."""
+_AHEAD = 0.3
+"""The same of a guess for periods that were not looked at yet."""
 _SEEN = 8
 """Periods that a guess for the next ones looks back on."""
 
@@ -96,7 +98,7 @@ class _Block:
         """A guess for the periods that follow, ``(2, 1, C, S, n)``."""
         last = torch.nan_to_num(self.needed[:, :, -_SEEN:], nan=0.0, posinf=0.0, neginf=0.0)
         low, high = last[0].amin(1), last[1].amax(1)
-        more = 2 * _MARGIN * (high - low) + TINY
+        more = _AHEAD * (high - low) + TINY
         return torch.stack([low - more, high + more])[:, None]
 
 
