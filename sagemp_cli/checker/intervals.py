@@ -258,7 +258,7 @@ def _silu(a: Interval) -> Interval:
     ends = a[0] * _sigmoid(a[0]), a[1] * _sigmoid(a[1])
     if a[0] >= -1 - least:
         return ends
-    return ends[::-1] if a[1] <= -1 - least else (-least, ends[0].max(ends[1]))
+    return (ends[1], ends[0]) if a[1] <= -1 - least else (-least, ends[0].max(ends[1]))
 
 
 def _rising(function: Callable[[arb], arb]) -> Callable[[Interval], Interval]:

@@ -123,7 +123,8 @@ def _coefficients(rate: Program, order: int) -> Program:
     out = Writer(n, n, m)
     c = solution(out, rate, out.state, out.numbers, out.disturbance, order + 1)
     nothing = out.constant([0.0] * n)
-    wanted = [nothing if c[q] is None else c[q] for q in ((2,) if order == 1 else (2, order + 1))]
+    found = (c[q] for q in ((2,) if order == 1 else (2, order + 1)))
+    wanted = [nothing if one is None else one for one in found]
     return out.finished({"next": out.state, "control": out.join(wanted)})
 
 

@@ -64,11 +64,11 @@ class Expansion:
         if kind in _EACH:
             return self._each(i, [series[q] for series in read], q)
         if kind == "mul":
-            return self._product(*read, q)
+            return self._product(read[0], read[1], q)
         if kind == "div":
-            return self._quotient(*read, self._of[slot], q)
+            return self._quotient(read[0], read[1], self._of[slot], q)
         if kind == "atan2":
-            return self._angle(slot, *read, q)
+            return self._angle(slot, read[0], read[1], q)
         if kind in ("sin", "cos"):
             return self._turn(i.reads[0], q)[kind == "cos"]
         if kind == "pow":

@@ -13,14 +13,16 @@ from matplotlib.figure import Figure
 from sagemp_cli.report.bounded_canvas import BoundedCanvas
 from sagemp_cli.storage.atomic import write_whole
 
-_TOO_LARGE = {"over": "ignore", "invalid": "ignore"}
-"""Scaling somebody else's numbers to a picture may overflow: what is drawn is bounded all the same."""
-
 
 def draw_beside(artifact: Path, draw: Callable[..., Figure], *artifacts: Any) -> Path:
     """Draw a figure of artifacts and save it as ``<artifact>.png`` beside the file that it shows."""
-    with np.errstate(**_TOO_LARGE):
+    with _unworried():
         return save_figure(draw(*artifacts), artifact.with_suffix(".png"))
+
+
+def _unworried() -> np.errstate:
+    """Scaling somebody else's numbers to a picture may overflow: what is drawn is bounded all the same."""
+    return np.errstate(over="ignore", invalid="ignore")
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -31,6 +33,6 @@ def save_figure(figure: Figure, path: Path) -> Path:
     """
     BoundedCanvas(figure)
     drawn = io.BytesIO()
-    with np.errstate(**_TOO_LARGE):
+    with _unworried():
         figure.savefig(drawn, format="png", metadata={"Software": "sagemp"})
     return write_whole(path, drawn.getvalue(), overwrite=True)
