@@ -11,7 +11,6 @@ from sagemp_cli.checker.balls import BITS, arb, ball, balls, ctx
 from sagemp_cli.checker.loop import Folded, Loop
 from sagemp_cli.checker.ode import Flow
 from sagemp_cli.checker.part import FlowClaim, PartProver
-from sagemp_cli.checker.ranges import Range, range_of
 from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.checker.zonotope import Zonotope
@@ -70,33 +69,33 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None =
             w = claim.disturbance_lower, claim.disturbance_upper
             loops = [Loop(folded, claim.windows, *w) for folded in programs]
             parts = None if flow is None else PartProver(flow, *(side[0, : flow.rate.states] for side in w))
-            ranges = [range_of(f, f.program.control) if f.program.control >= 0 else [] for f in programs]
-            states = Zonotope.box(claim.lower, claim.upper)
+            states, box = Zonotope.box(claim.lower, claim.upper), _box(claim.lower, claim.upper)
             if not ((claim.tube_lower[0] <= claim.lower) & (claim.upper <= claim.tube_upper[0])).all():
                 raise Unproved("the tube does not contain the cell")
             for k, which in enumerate(claim.program.tolist()):
-                step = Step(loops[which], k, states, _record(claim, k, programs[which]))
+                folded = programs[which]
+                known = box if parts is None else None  # there no record rests on intervals of states
+                step = Step(loops[which], k, states, known, _record(claim, k, folded))
                 after, control, deviation = step.run()
                 asked: list[Bounds] = []
                 if control is not None:
-                    asked = [_both(a, b) for a, b in zip(step.bounds(control), ranges[which], strict=True)]
+                    asked = step.output(folded.program.control, step.bounds(control))
                 m = claim.control_lower.shape[1]
                 _require_inside(asked[:m], claim.control_lower[k], claim.control_upper[k], "control")
                 if parts is not None:
                     if claim.flow is None:
                         raise Unproved("nothing is said of the flow between the instants")
-                    begin = states.bounds() if k else list(zip(balls(claim.lower), balls(claim.upper), strict=True))
-                    _prove_period(parts, claim.flow, k, begin, asked[:m], asked[m:])
+                    _prove_period(parts, claim.flow, k, box, asked[:m], asked[m:])
                 if claim.deviation is not None:
                     if deviation is None:
                         raise Unproved("the program has no deviation")
-                    _require_inside(
-                        step.bounds(deviation), -claim.deviation[k], claim.deviation[k], "deviation in state"
-                    )
+                    found = step.output(folded.program.deviation, step.bounds(deviation))
+                    _require_inside(found, -claim.deviation[k], claim.deviation[k], "deviation in state")
                 states = step.image(after)
+                box = step.output(folded.program.next, states.bounds())
                 if claim.kept is not None:
                     states = states.reduced(_mask(claim.kept[k], states.generators.shape[1]))
-                _require_inside(states.bounds(), claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
+                _require_inside(box, claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
         except (Unproved, ArithmeticError) as e:
             return f"step {k}: {e}"
     return ""
@@ -123,9 +122,8 @@ def _record(claim: CellClaim, k: int, folded: Folded) -> list[Entry]:
     return [Entry(*entry) for entry in zip(*columns, strict=True)]
 
 
-def _both(a: Bounds, b: Range) -> Bounds:
-    """What lies in two intervals."""
-    return a if b is None else (a[0].max(b[0]), a[1].min(b[1]))
+def _box(lower: np.ndarray, upper: np.ndarray) -> list[Bounds]:
+    return list(zip(balls(lower), balls(upper), strict=True))
 
 
 def _mask(row: np.ndarray, count: int) -> np.ndarray:

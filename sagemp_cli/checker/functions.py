@@ -45,7 +45,8 @@ class Smooth:
 
     def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
         """See the module."""
-        todo, splits = [(lower, upper)], 0
+        todo = [] if lower == upper else [(lower, upper)]  # at a point no slope is needed, it may be infinite
+        splits = 0
         ends = [self.value(x) - slope * x for x in (lower, upper)]
         least, most = ends[0].min(ends[1]), ends[0].max(ends[1])
         while todo:

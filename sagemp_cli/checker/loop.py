@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sagemp_cli.checker.balls import arb, arb_mat, balls
+from sagemp_cli.checker.beside import Combinations
 from sagemp_cli.checker.points import Point, value_of
-from sagemp_cli.checker.program import INPUTS, MOVES, Program
-from sagemp_cli.checker.rows import ZERO, Rows, Weights, column, combined, joined, weights_of
+from sagemp_cli.checker.program import INPUTS, Program
+from sagemp_cli.checker.rows import ZERO, Rows, Weights, column, combined, joined, keeps_linear, weights_of
 
 ONE = arb(1)
 
@@ -30,6 +31,7 @@ class Folded:
         known: whether a slot is one of these or stands behind them, so that no step computes it.
         weights: of the other ``linear`` instructions.
         last: the last slot that reads each slot.
+        combinations: all slots, ready for intervals.
     """
 
     program: Program
@@ -38,6 +40,7 @@ class Folded:
     known: tuple[bool, ...]
     weights: Mapping[int, Weights]
     last: tuple[int, ...]
+    combinations: Combinations
 
     @classmethod
     def of(cls, program: Program) -> Folded:
@@ -67,7 +70,8 @@ class Folded:
         for slot in outputs:
             last[slot] = count
         known = tuple(slot in constants or slot in linear for slot in range(count))
-        return cls(program, constants, {s: r for s, r in linear.items() if s in needed}, known, weights, tuple(last))
+        kept = {s: r for s, r in linear.items() if s in needed}
+        return cls(program, constants, kept, known, weights, tuple(last), Combinations(program, constants))
 
 
 class Loop:
@@ -81,6 +85,7 @@ class Loop:
 
     def __init__(self, folded: Folded, windows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         self.folded = folded
+        self._inputs = lower, upper, windows
         n, d, g = folded.program.states, folded.program.disturbances, folded.program.numbers
         ends = list(zip(balls(lower.T.flat), balls(upper.T.flat), strict=True))  # one disturbance after the other
         steps = len(windows)
@@ -94,6 +99,11 @@ class Loop:
             self._on_state[slot] = arb_mat(len(wide), n, [a for row in wide for a in row[1 : 1 + n]])
             self._rest[slot] = [(row[1 : 1 + n], _trimmed(row[1 + n : 1 + n + d])) for row in wide]
 
+    def given(self, k: int) -> list[tuple[arb, arb]]:
+        """Both ends of the disturbances and of the numbers of step k, one after the other."""
+        lower, upper, windows = (balls(rows[k]) for rows in self._inputs)
+        return [*zip(lower, upper, strict=True), *zip(windows, windows, strict=True)]
+
     def rows(self, slot: int, k: int, center: arb_mat) -> Rows:
         """Rows of a linear slot at step k, where the states are around the ``center (n, 1)``."""
         columns, at, radius = self._columns[slot], self._on_state[slot] * center, self._radius[k]
@@ -101,14 +111,6 @@ class Loop:
             [columns[i, k] + at[i, 0], *_trimmed(on_state + [b * r for b, r in zip(on_w, radius, strict=False)])]
             for i, (on_state, on_w) in enumerate(self._rest[slot])
         ]
-
-
-def keeps_linear(program: Program, slot: int) -> bool:
-    """Whether a slot is linear in its operands, of which those that depend on nothing count as numbers."""
-    instruction = program.instructions[slot]
-    given = [program.depends[r] for r in instruction.reads]
-    kind = instruction.kind
-    return kind in MOVES or (kind == "mul" and not all(given)) or (kind == "div" and not given[1])
 
 
 def _trimmed(row: list) -> list:

@@ -1,82 +1,161 @@
-"""What an output of a program never leaves, whatever the state: a control that saturates."""
+"""What an instruction makes of intervals: two ends for every entry, exact or balls around the exact end.
+
+None stands for an interval of which nothing is known. Only what a function gives over the whole line is said of that.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from sagemp_cli.checker.balls import arb, ball, balls
-from sagemp_cli.checker.loop import Folded
+from sagemp_cli.checker.balls import arb, ball
+from sagemp_cli.checker.functions import function_of
 from sagemp_cli.checker.program import Instruction
+from sagemp_cli.checker.unproved import Unproved
 
 Range = tuple[arb, arb] | None
 """Ends of an interval; None where nothing is known."""
 
-
-def range_of(folded: Folded, slot: int) -> list[Range]:
-    """Bounds of each entry of a slot."""
-    program = folded.program
-    ranges: list[list[Range]] = []
-    for i, instruction in enumerate(program.instructions[: slot + 1]):
-        if i in folded.constants:
-            ranges.append([(v, v) for v in folded.constants[i]])
-        else:
-            ranges.append(_range(instruction, [ranges[r] for r in instruction.reads], program.widths[i]))
-    return ranges[slot]
+_ZERO = arb(0)
 
 
-def _range(instruction: Instruction, operands: Sequence[list[Range]], width: int) -> list[Range]:
+def values(instruction: Instruction, operands: Sequence[Sequence[Range]]) -> list[Range]:
+    """Of a nonlinear instruction, from those of its operands, which are equally long."""
     kind = instruction.kind
-    if kind in _BOUNDED:
-        return [(ball(_BOUNDED[kind][0]), ball(_BOUNDED[kind][1]))] * width
-    if kind == "clamp":
-        lower, upper = instruction.constants.reshape(2, width)
-        known = (abs(lower) < float("inf")) & (abs(upper) < float("inf"))
-        return [(ball(a), ball(b)) if k else None for a, b, k in zip(lower, upper, known, strict=True)]
-    if kind == "pick":
-        return [operands[0][i] for i in instruction.entries]
-    if kind == "join":
-        return [entry for operand in operands for entry in operand]
-    if kind == "neg":
-        return [_times(r, ball(-1)) for r in operands[0]]
-    if kind in ("add", "sub", "mul"):
-        a, b = ([*o] * (width if len(o) == 1 else 1) for o in operands)
-        if kind == "mul":
-            return [_product(x, y) for x, y in zip(a, b, strict=True)]
-        sign = ball(1 if kind == "add" else -1)
-        return [_sum(x, _times(y, sign)) for x, y in zip(a, b, strict=True)]
-    if kind == "linear":
-        return _linear(instruction, operands[0], width)
-    return [None] * width
+    if kind in _PAIRS:
+        if kind == "mul" and instruction.reads[0] == instruction.reads[1]:
+            return [_outwards(None if a is None else _power(a, 2)) for a in operands[0]]
+        pairs = zip(*operands, strict=True)
+        return [_outwards(None if a is None or b is None else _PAIRS[kind](a, b)) for a, b in pairs]
+    return [_outwards(_of_one(instruction, i, a)) for i, a in enumerate(operands[0])]
 
 
-def _linear(instruction: Instruction, operand: list[Range], width: int) -> list[Range]:
-    columns = len(operand)
-    weights = instruction.constants[: width * columns].reshape(width, columns)
-    out: list[Range] = [(b, b) for b in balls(instruction.constants[width * columns :])]
-    for i, row in enumerate(weights.tolist()):
-        for w, r in zip(row, operand, strict=True):
-            if w:
-                out[i] = _sum(out[i], _times(r, ball(w)))
-    return out
+def both(a: Range, b: Range) -> Range:
+    """What lies in two intervals."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a[0].max(b[0]), a[1].min(b[1])
 
 
-def _product(a: Range, b: Range) -> Range:
-    """Ends of a product of which one factor is a number; nothing is said of others."""
-    for number, other in ((a, b), (b, a)):
-        if number is not None and number[0].is_exact() and number[0] == number[1]:
-            return number if number[0] == 0 else _times(other, number[0])
-    return None
-
-
-def _times(a: Range, factor: arb) -> Range:
-    if a is None:
+def _outwards(a: Range) -> Range:
+    """Exact ends; None where one is not finite."""
+    if a is None or not (a[0].is_finite() and a[1].is_finite()):
         return None
-    ends = a[0] * factor, a[1] * factor
-    return ends if factor > 0 else (ends[1], ends[0])
+    return a[0].lower(), a[1].upper()
 
 
-def _sum(a: Range, b: Range) -> Range:
-    return None if a is None or b is None else (a[0] + b[0], a[1] + b[1])
+def _of_one(instruction: Instruction, i: int, a: Range) -> Range:
+    """Entry i of a function."""
+    kind, constants = instruction.kind, instruction.constants.tolist()
+    if kind == "clamp":
+        limits = constants[i], constants[len(constants) // 2 + i]
+        if a is None:
+            finite = all(abs(limit) < float("inf") for limit in limits)
+            return (ball(min(limits)), ball(limits[1])) if finite else None
+        low, high = (_clamped(x, *limits) for x in a)
+        return low, high
+    if a is None:
+        return (ball(_BOUNDED[kind][0]), ball(_BOUNDED[kind][1])) if kind in _BOUNDED else None
+    if kind == "pow":
+        return _power(a, int(constants[0]))
+    if kind in _OWN:
+        return _OWN[kind](a)
+    function = function_of(kind, constants)
+    if kind in _RISING or (kind == "leaky_relu" and constants[0] >= 0):
+        return function.value(a[0]), function.value(a[1])
+    try:
+        return function.excess(_ZERO, *a)
+    except Unproved:
+        return None
 
+
+def _clamped(x: arb, low: float, high: float) -> arb:
+    x = x.max(ball(low)) if low > -float("inf") else x
+    return x.min(ball(high)) if high < float("inf") else x
+
+
+def _product(a: tuple[arb, arb], b: tuple[arb, arb]) -> Range:
+    corners = [x * y for x in a for y in b]
+    low, high = corners[0], corners[0]
+    for c in corners[1:]:
+        low, high = low.min(c), high.max(c)
+    return low, high
+
+
+def _reciprocal(a: tuple[arb, arb]) -> Range:
+    return (1 / a[1], 1 / a[0]) if a[0] > 0 or a[1] < 0 else None
+
+
+def _quotient(a: tuple[arb, arb], b: tuple[arb, arb]) -> Range:
+    inverse = _reciprocal(b)
+    return None if inverse is None else _product(a, inverse)
+
+
+def _angle(y: tuple[arb, arb], x: tuple[arb, arb]) -> Range:
+    """The whole circle if the box may meet the jump."""
+    if not (x[0] > 0 or y[0] > 0 or y[1] < 0):
+        return -arb.pi(), arb.pi()
+    corners = [arb.atan2(b, a) for b in y for a in x]
+    low, high = corners[0], corners[0]
+    for c in corners[1:]:
+        low, high = low.min(c), high.max(c)
+    return low, high
+
+
+def _power(a: tuple[arb, arb], exponent: int) -> Range:
+    if exponent < 0:
+        whole = _power(a, -exponent)
+        return None if whole is None or not (a[0] > 0 or a[1] < 0) else _reciprocal(whole)
+    ends = a[0] ** exponent, a[1] ** exponent
+    if exponent % 2 or a[0] >= 0:
+        return ends
+    return ends[::-1] if a[1] <= 0 else (_ZERO, ends[0].max(ends[1]))
+
+
+def _size(a: tuple[arb, arb]) -> Range:
+    if a[0] >= 0:
+        return a
+    return (-a[1], -a[0]) if a[1] <= 0 else (_ZERO, (-a[0]).max(a[1]))
+
+
+def _met(a: tuple[arb, arb], first: arb, parts: int = 1) -> bool:
+    """Whether ``first``, or a whole number of such parts of a turn beside it, may lie between the ends."""
+    turn = 2 * arb.pi() / parts
+    low, high = (a[0] - first) / turn, (a[1] - first) / turn
+    return not low.lower().ceil() > high.upper().floor()
+
+
+def _wave(a: tuple[arb, arb], function: Callable[[arb], arb], highest: arb) -> Range:
+    """A sine or cosine, of which one highest point is known."""
+    ends = function(a[0]), function(a[1])
+    low = ball(-1) if _met(a, highest + arb.pi()) else ends[0].min(ends[1])
+    high = ball(1) if _met(a, highest) else ends[0].max(ends[1])
+    return low, high
+
+
+def _tangent(a: tuple[arb, arb]) -> Range:
+    """It rises between two poles, half a turn apart."""
+    return None if _met(a, arb.pi() / 2, parts=2) else (arb.tan(a[0]), arb.tan(a[1]))
+
+
+_PAIRS: dict[str, Callable[[tuple[arb, arb], tuple[arb, arb]], Range]] = {
+    "mul": _product,
+    "div": _quotient,
+    "atan2": _angle,
+    "maximum": lambda a, b: (a[0].max(b[0]), a[1].max(b[1])),
+    "minimum": lambda a, b: (a[0].min(b[0]), a[1].min(b[1])),
+}
+
+_OWN: dict[str, Callable[[tuple[arb, arb]], Range]] = {
+    "sin": lambda a: _wave(a, arb.sin, arb.pi() / 2),
+    "cos": lambda a: _wave(a, arb.cos, _ZERO),
+    "tan": _tangent,
+    "abs": _size,
+    "relu": lambda a: (a[0].max(_ZERO), a[1].max(_ZERO)),
+    "identity": lambda a: a,
+    "reciprocal": _reciprocal,
+}
+
+_RISING = ("atan", "tanh", "sigmoid", "exp", "log", "sqrt", "elu", "softplus")
+"""Outside of their domain they give what is not finite."""
 
 _BOUNDED = {"sin": (-1.0, 1.0), "cos": (-1.0, 1.0), "tanh": (-1.0, 1.0), "sigmoid": (0.0, 1.0)}

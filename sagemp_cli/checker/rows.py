@@ -7,7 +7,7 @@ from itertools import repeat
 
 from sagemp_cli.checker.balls import arb, arb_mat, balls
 from sagemp_cli.checker.points import Point
-from sagemp_cli.checker.program import Instruction
+from sagemp_cli.checker.program import MOVES, Instruction, Program
 
 Row = list[arb]
 Rows = list[Row]
@@ -15,6 +15,14 @@ Weights = tuple[arb_mat, Point]
 """Matrix and bias of a ``linear``."""
 
 ZERO = arb(0)
+
+
+def keeps_linear(program: Program, slot: int) -> bool:
+    """Whether a slot is linear in its operands, of which those that depend on nothing count as numbers."""
+    instruction = program.instructions[slot]
+    given = [program.depends[r] for r in instruction.reads]
+    kind = instruction.kind
+    return kind in MOVES or (kind == "mul" and not all(given)) or (kind == "div" and not given[1])
 
 
 def combined(instruction: Instruction, operands: Sequence[Rows], weights: Weights | None) -> Rows:

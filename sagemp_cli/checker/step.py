@@ -2,8 +2,9 @@
 
 Rows are those of :mod:`~sagemp_cli.checker.zonotope`, over the states, the disturbances and one variable for each
 recorded relaxation. What is linear acts on rows. A nonlinear operation takes the next recorded relaxations, *proves*
-that the recorded lines and radii enclose the function over the operand's own bounds, and gives its variables the radii
-that it found itself. So the record is never trusted.
+that the recorded lines and radii enclose the function over the operand's own bounds, which are those of its row and of
+its interval (:mod:`~sagemp_cli.checker.beside`), and gives its variables the radii that it found itself. So the record
+is never trusted.
 """
 
 from __future__ import annotations
@@ -14,15 +15,32 @@ from typing import NamedTuple
 
 from sagemp_cli.checker.angle import Turned, angle_excess
 from sagemp_cli.checker.balls import arb, arb_mat, ball
+from sagemp_cli.checker.beside import Beside
 from sagemp_cli.checker.functions import FUNCTIONS
-from sagemp_cli.checker.loop import Loop, keeps_linear
+from sagemp_cli.checker.loop import Loop
 from sagemp_cli.checker.points import functions_of
 from sagemp_cli.checker.program import Instruction
-from sagemp_cli.checker.rows import ZERO, Row, Rows, added, column, combined, joined, repeated, subtracted, times
+from sagemp_cli.checker.ranges import Range
+from sagemp_cli.checker.rows import (
+    ZERO,
+    Row,
+    Rows,
+    added,
+    column,
+    combined,
+    joined,
+    keeps_linear,
+    repeated,
+    subtracted,
+    times,
+)
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.checker.zonotope import Zonotope
 
 _UNDERFLOW = 2.0**-800  # a recorded radius may be 0 instead; what goes on is the radius found here
+
+Bounds = tuple[arb, arb]
+"""Lower and upper end."""
 
 Excess = Callable[[arb, arb, arb], tuple[arb, arb]]
 """Bounds of ``f(x) - slope x`` for all x of ``[lower, upper]``."""
@@ -43,10 +61,17 @@ class Step:
         loop: what is evaluated.
         k: which step.
         states: the set at its beginning.
+        box: bounds of the states, which the set may reach past; None: of them intervals know nothing, and say no more
+            than what functions give whatever the state.
         record: recorded relaxations in order.
     """
 
-    def __init__(self, loop: Loop, k: int, states: Zonotope, record: Sequence[Entry]) -> None:
+    def __init__(
+        self, loop: Loop, k: int, states: Zonotope, box: Sequence[Bounds] | None, record: Sequence[Entry]
+    ) -> None:
+        self._known = box is not None
+        inputs = [None] * loop.folded.program.states if box is None else box
+        self._beside = Beside(loop.folded.combinations, [*inputs, *loop.given(k)])
         self._loop, self._k, self._states, self._record = loop, k, states, record
         self._center = arb_mat(len(states.center), 1, states.center)
         program = loop.folded.program
@@ -78,6 +103,10 @@ class Step:
         radii = self._states.radii(joined(rows, self._inputs))
         return [((row[0] - r).lower(), (row[0] + r).upper()) for row, r in zip(rows, radii, strict=True)]
 
+    def output(self, slot: int, bounds: Sequence[Bounds]) -> list[Bounds]:
+        """Bounds of an output, from those of its rows."""
+        return _within(bounds, self._beside.output(slot))
+
     def image(self, rows: Rows) -> Zonotope:
         """The set of the values of rows, over all variables of the step."""
         return self._states.image(joined(rows, self._first + self._loop.folded.program.variables))
@@ -97,42 +126,64 @@ class Step:
         given = [folded.program.depends[r] for r in instruction.reads]
         if keeps_linear(folded.program, slot):
             return combined(instruction, operands, folded.weights.get(slot))
+        within = self._beside.operands(slot)
+        before = [list(side) for side in within]
         if kind == "mul":
-            return self._product(*repeated(operands))
-        if kind == "div":
-            return self._quotient(*operands, numbers=not given[0])
-        if kind in ("maximum", "minimum"):
-            return self._extreme(kind, *operands) if all(given) else self._limited(kind, operands, given)
-        if kind == "atan2":
-            return self._angle(*repeated(operands))
-        functions = functions_of(instruction, len(operands[0]))
-        return self._relaxed(kind, operands[0], [f.excess for f in functions])
+            rows = self._product(*repeated(operands), within)
+        elif kind == "div":
+            rows = self._quotient(*operands, within, numbers=not given[0])
+        elif kind in ("maximum", "minimum"):
+            rows = (
+                self._extreme(kind, *operands, within) if all(given) else self._limited(kind, operands, given, within)
+            )
+        elif kind == "atan2":
+            rows = self._angle(*repeated(operands), within)
+        else:
+            functions = functions_of(instruction, len(operands[0]))
+            rows = self._relaxed(kind, operands[0], [f.excess for f in functions], within[0])
+        self._beside.know(slot, instruction, within if self._known else before)
+        return rows
 
-    def _relaxed(self, name: str, rows: Rows, functions: Sequence[Excess]) -> Rows:
-        """A function of the value of every row."""
+    def _relaxed(self, name: str, rows: Rows, functions: Sequence[Excess], within: list[Range]) -> Rows:
+        """A function of the value of every row; what is known of the values is narrowed to what its rows say too."""
         entries = self._take(len(rows))
         slopes = [ball(e.slope) for e in entries]
-        bounds = self.bounds(rows)
+        bounds = _within(self.bounds(rows), within)
+        within[:] = bounds
         found = [f(s, low, high) for f, s, (low, high) in zip(functions, slopes, bounds, strict=True)]
         return [
             self._put(name, times(row, slope), bounds, entry)
             for row, slope, bounds, entry in zip(rows, slopes, found, entries, strict=True)
         ]
 
-    def _product(self, left: Rows, right: Rows) -> Rows:
+    def _product(self, left: Rows, right: Rows, within: Sequence[list[Range]] | None) -> Rows:
         """Product of values whose deviations X and Y may be correlated: ``X Y = (P^2 - M^2) / 4`` with
         ``P = l X + Y / l`` and ``M = l X - Y / l``, for the recorded scale l as for any other.
         """
         entries = self._take(len(left))
         if not all(e.slope > 0 for e in entries):
             raise Unproved("the scale of a product must be positive")
-        plus, minus = self._ends(left, right, [ball(e.slope) for e in entries])
+        scales = [ball(e.slope) for e in entries]
+        plus, minus = self._ends(left, right, scales)
+        if within is not None:
+            x, y = (
+                [_far(row, b) for row, b in zip(*side, strict=True)] for side in self._narrowed(left, right, within)
+            )
+            most = [(a * s + b / s).upper() for a, b, s in zip(x, y, scales, strict=True)]
+            plus, minus = ([a.min(b) for a, b in zip(side, most, strict=True)] for side in (plus, minus))
         out = []
         for a, b, p, m, entry in zip(left, right, plus, minus, entries, strict=True):
             row = added(times(a, b[0]), times(b, a[0]))
             row[0] = a[0] * b[0]
             out.append(self._put("product", row, (-(m**2) / 4, p**2 / 4), entry))
         return out
+
+    def _narrowed(self, left: Rows, right: Rows, within: Sequence[list[Range]]) -> list[tuple[Rows, list[Bounds]]]:
+        """Both factors with their bounds; what is known of their values is narrowed to them."""
+        found = self.bounds([*left, *right])
+        sides = _within(found[: len(left)], within[0]), _within(found[len(left) :], within[1])
+        within[0][:], within[1][:] = sides
+        return list(zip((left, right), sides, strict=True))
 
     def _ends(self, left: Rows, right: Rows, scales: Sequence[arb]) -> tuple[list[arb], list[arb]]:
         """Radii of ``P = l X + Y / l`` and ``M = l X - Y / l``, X and Y the deviations of rows."""
@@ -141,37 +192,41 @@ class Step:
         radii = self._states.radii(joined(both, self._inputs))
         return radii[: len(pairs)], radii[len(pairs) :]
 
-    def _quotient(self, left: Rows, right: Rows, *, numbers: bool) -> Rows:
+    def _quotient(self, left: Rows, right: Rows, within: Sequence[list[Range]], *, numbers: bool) -> Rows:
         """``a / b = q + (a - q b) (1 / b)``, for q near the centres' quotient as for any other; of a number a only
         ``a (1 / b)``.
         """
-        inverse = self._relaxed("reciprocal", right, [FUNCTIONS["reciprocal"].excess] * len(right))
+        known = within[1][: len(right)]  # one divisor may be that of all entries
+        inverse = self._relaxed("reciprocal", right, [FUNCTIONS["reciprocal"].excess] * len(right), known)
+        within[1][:] = known * (len(within[1]) // len(known))
         left, right, inverse = repeated([left, right, inverse])
         if numbers:
             return [times(b, a[0]) for a, b in zip(left, inverse, strict=True)]
         near = [(a[0] / b[0]).mid() for a, b in zip(left, right, strict=True)]
         q = [ball(float(v)) if v.is_finite() else ZERO for v in near]
         rest = [subtracted(a, times(b, v)) for a, b, v in zip(left, right, q, strict=True)]
-        out = self._product(rest, inverse)
+        out = self._product(rest, inverse, None)
         for row, v in zip(out, q, strict=True):
             row[0] = row[0] + v
         return out
 
-    def _extreme(self, kind: str, left: Rows, right: Rows) -> Rows:
+    def _extreme(self, kind: str, left: Rows, right: Rows, within: Sequence[list[Range]]) -> Rows:
         """``maximum(a, b) = b + relu(a - b)`` and ``minimum(a, b) = a - relu(a - b)``."""
         left, right = repeated([left, right])
         rest = [subtracted(a, b) for a, b in zip(left, right, strict=True)]
-        above = self._relaxed("relu", rest, [FUNCTIONS["relu"].excess] * len(rest))
+        above = self._relaxed("relu", rest, [FUNCTIONS["relu"].excess] * len(rest), within[2])
         if kind == "maximum":
             return [added(b, c) for b, c in zip(right, above, strict=True)]
         return [subtracted(a, c) for a, c in zip(left, above, strict=True)]
 
-    def _limited(self, kind: str, operands: Sequence[Rows], given: Sequence[bool]) -> Rows:
+    def _limited(
+        self, kind: str, operands: Sequence[Rows], given: Sequence[bool], within: Sequence[list[Range]]
+    ) -> Rows:
         """The same with numbers on one side: a clamp."""
         value, limits = repeated(operands if given[0] else operands[::-1])
-        return self._relaxed("clamp", value, [_limit(kind, c[0]) for c in limits])
+        return self._relaxed("clamp", value, [_limit(kind, c[0]) for c in limits], within[0 if given[0] else 1])
 
-    def _angle(self, y: Rows, x: Rows) -> Rows:
+    def _angle(self, y: Rows, x: Rows, within: Sequence[list[Range]]) -> Rows:
         """``atan2(y, x)``, around the recorded line of how far the point is across the recorded direction."""
         entries, directions = self._take(len(y)), self._take(len(y))
         cosines, sines = [ball(d.slope) for d in directions], [ball(d.offset) for d in directions]
@@ -181,7 +236,8 @@ class Step:
         v, u = self.bounds(across), self.bounds(along)
         scales = [_ratio(u[i][1] - u[i][0], v[i][1] - v[i][0]) for i in range(len(y))]
         plus, minus = self._ends(across, along, scales)
-        boxes = list(zip(self.bounds(y), self.bounds(x), strict=True))
+        sides = (_within(self.bounds(rows), known) for rows, known in zip((y, x), within, strict=True))
+        boxes = list(zip(*sides, strict=True))
         out = []
         for i, entry in enumerate(entries):
             turned = Turned(cosines[i], sines[i], v[i], u[i], across[i][0], along[i][0], plus[i], minus[i])
@@ -211,6 +267,16 @@ class Step:
         row.append(radius)
         self._next += 1
         return row
+
+
+def _within(bounds: Sequence[Bounds], known: Sequence[Range]) -> list[Bounds]:
+    """Bounds of rows, within intervals."""
+    return [a if b is None else (a[0].max(b[0]), a[1].min(b[1])) for a, b in zip(bounds, known, strict=True)]
+
+
+def _far(row: Row, bounds: Bounds) -> arb:
+    """How far a value within bounds may be from a row's first entry."""
+    return (bounds[1] - row[0]).max(row[0] - bounds[0]).upper()
 
 
 def _limit(kind: str, c: arb) -> Excess:

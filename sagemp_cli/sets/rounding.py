@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
 
 UNIT = 2.0**-53
 """Unit roundoff u of float64: a correctly rounded operation errs by at most ``u`` times its result."""
@@ -71,6 +71,10 @@ ROUNDED = gamma(8)
 three roundings each, relative to the larger; beside that the smaller, near 0, may be lost in both."""
 
 
+SUM = gamma(1)
+"""Of ``a + b``."""
+
+
 def combined(terms: int) -> float:
     """Of a fixed combination of so many basic values, relative to the sum of all magnitudes.
 
@@ -108,11 +112,15 @@ def of_generators(states: int) -> float:
     return gamma(2 * states + 16)
 
 
-def round_down(value: Tensor) -> Tensor:
-    """The next float64 below each entry (infinities stay)."""
+def round_down(value: Any) -> Any:
+    """The next float64 below each entry (infinities stay); of tensors or of arrays."""
+    if isinstance(value, np.ndarray):
+        return np.nextafter(value, -math.inf)
     return torch.nextafter(value, torch.full_like(value, -math.inf))
 
 
-def round_up(value: Tensor) -> Tensor:
-    """The next float64 above each entry (infinities stay)."""
+def round_up(value: Any) -> Any:
+    """The next float64 above each entry (infinities stay); of tensors or of arrays."""
+    if isinstance(value, np.ndarray):
+        return np.nextafter(value, math.inf)
     return torch.nextafter(value, torch.full_like(value, math.inf))

@@ -34,6 +34,10 @@ class Tube:
         """Whether whole rollouts ``(..., K+1, n)`` stay inside, one flag per rollout."""
         return ((self.lower <= states) & (states <= self.upper)).flatten(-2).all(-1)
 
+    def intersected(self, other: Tube) -> Tube:
+        """What lies in both, of two tubes that enclose the same rollouts."""
+        return Tube(torch.maximum(self.lower, other.lower), torch.minimum(self.upper, other.upper))
+
     def hull(self, dim: int = 0) -> Tube:
         """The union's box hull per step along a batch dimension (the tube of all cells together)."""
         return Tube(self.lower.amin(dim), self.upper.amax(dim))

@@ -168,19 +168,20 @@ def own_sets(document, c):
             np.concatenate([w, w, flow[f"remainder_{s}"][c]], -1).reshape(document.horizon, -1)
             for w, s in zip(rest, ("lower", "upper"), strict=True)
         ]
-        loop = Loop(Folded.of(document.ode.step), document.windows(0), *sides)
-        states, at, inner = Zonotope.box(tubes["cell_lower"][c], tubes["cell_upper"][c]), [], []
+        program = document.ode.step
+        loop = Loop(Folded.of(program), document.windows(0), *sides)
+        states = Zonotope.box(tubes["cell_lower"][c], tubes["cell_upper"][c])
+        at, inner = [states.bounds()], []
         for k in range(document.horizon):
-            at.append(states.bounds())
             columns = (found[name][c, k].tolist() for name in ("slope", "offset", "radius"))
-            step = Step(loop, k, states, [Entry(*entry) for entry in zip(*columns, strict=True)])
+            step = Step(loop, k, states, None, [Entry(*entry) for entry in zip(*columns, strict=True)])
             after, watched, _ = step.run()
-            inner.append(step.bounds(watched))
+            inner.append(step.output(program.control, step.bounds(watched)))
             states = step.image(after)
+            at.append(step.output(program.next, states.bounds()))
             if "kept" in found:
                 bits = np.unpackbits(found["kept"][c, k], bitorder="little")[: states.generators.shape[1]]
                 states = states.reduced(bits.astype(bool))
-        at.append(states.bounds())
         return [np.array([[[float(end) for end in side] for side in row] for row in rows]) for rows in (at, inner)]
 
 

@@ -673,7 +673,7 @@ def test_a_tube_for_every_cell_is_given_on_request():
 
 def test_cells_are_found_where_they_narrow_the_tube():
     def step(x, w):  # only the first state's spread costs width
-        return torch.stack([x[..., 0] * x[..., 0] - 0.3, 0.5 * x[..., 1]], -1)
+        return torch.stack([x[..., 0] * x[..., 0] - 0.9 * x[..., 0] - 0.3, 0.5 * x[..., 1]], -1)
 
     start = Box.around([0.2, 0.0], [0.4, 0.4])
     found = reach(step, start, horizon=3, partitions="auto", per_cell=True)

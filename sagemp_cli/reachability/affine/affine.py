@@ -12,6 +12,8 @@ block), so the tube encloses every real-arithmetic rollout.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,7 +27,7 @@ from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine.boxed import Boxed
 from sagemp_cli.reachability.affine.compiled.hints import Hints
-from sagemp_cli.reachability.affine.compiled.run import Steps
+from sagemp_cli.reachability.affine.compiled.run import BLOCK, Done, Steps
 from sagemp_cli.reachability.affine.compiled.steps import KeptStep
 from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.program.loops import RecordedLoop
@@ -100,15 +102,16 @@ class Affine(Propagator):
         return Reach(run.tube, lower, upper, recording, run.notes)
 
     def footprint(self, size: LoopSize) -> Footprint:
-        """Of M generators at the last step, as many as if none were negligible: ``6 M n + 12 v^2`` numbers and
-        twice what is kept, which is bounds, ``3 K E`` numbers of the recording and a bit per generator and step.
+        """Of M generators at the last step, as many as if none were negligible: ``6 M n + 12 v^2`` numbers, ``10 v``
+        for each step of a block that is checked against intervals, and twice what is kept, which is bounds, ``3 K E``
+        numbers of the recording and a bit per generator and step.
         """
         v, steps = size.variables, size.steps
         generators = size.states + steps * v  # a step adds disturbances, relaxations, a column of rounding per state
         if self.symbols is not None:
             generators = min(generators, max(self.symbols, size.states + 1) + v)
         kept = size.bounds + 3 * steps * size.entries + steps * generators / 64
-        working = generators * 6 * size.states + 12 * v**2 + 2 * kept
+        working = generators * 6 * size.states + 12 * v**2 + 10 * v * min(BLOCK, steps) + 2 * kept
         return Footprint(NUMBER * working, NUMBER * kept)
 
     @np.errstate(all="ignore")  # what overflows has infinite bounds
@@ -123,6 +126,7 @@ class Affine(Propagator):
         hints: Sequence[Hints] | None = None,
         watch: bool = False,
         states: Zonotope | None = None,
+        intervals: bool = True,
     ) -> AffineRun:
         """Propagate, and keep what else is asked for; differentiable where autograd is on and something wants it.
 
@@ -134,6 +138,7 @@ class Affine(Propagator):
             hints: per step, bounds of the operations' inputs that are known to hold; each is intersected with its own.
             watch: bound the controls, and the deviations of a learned robot that is compared with its model.
             states: the set to begin with, of arrays, for all B cells, where that is more than its box ``start``.
+            intervals: whether values have an interval beside their form, where nothing is differentiated.
 
         Raises:
             UsageError: a loop that is to be watched does not say what its controls are.
@@ -143,43 +148,107 @@ class Affine(Propagator):
             raise UsageError(f"{type(loop).__name__} has a step of its own, which does not say what its controls are")
         differentiated = torch.is_grad_enabled() and _wants_gradient(known, start, disturbance)
         batch, n = start.lower.shape[:-1], start.dim
-        steps = Steps(known, disturbance, batch, tensors=differentiated)
         whole = Zonotope(start.center.reshape(-1, n), torch.diag_embed(start.radius.reshape(-1, n)))
         if states is None:
             states = whole if differentiated else Zonotope(whole.center.numpy(), whole.generators.numpy())
-
-        lows, highs, bands, masks, controls, kept, again = [], [], [], [], [], [], 0
-        boxed = Boxed(self.symbols)
-        for k in range(loop.horizon if horizon is None else horizon):
-            frame, after, watched = steps.evaluate(k, states, None if hints is None else hints[k])
-            bands.append([pair for r in frame.relaxed for pair in recorded_bands(r.name, r.band, r.turn)])
-            if watch and watched is not None:
-                controls.append(frame.bounds(watched))
-            if keep_steps:
-                kept.append(KeptStep.of(frame, after))
-            states = every = frame.advanced(after)
-            mask = np.ones(states.order, dtype=bool)
-            # Looking for generators to drop costs as much as a step: only when there are a good deal more than before.
-            if states.order > (again if self.symbols is None else max(self.symbols, n + 1)):
-                states, chosen = states.reduce_order(self.symbols)
-                mask = mask if chosen is None else chosen
-                again = max(states.order * 5 // 4, states.order + 64)
-            masks.append(mask)
-            if self.symbols is not None:
-                boxed.follow(every.generators.detach() if differentiated else every.generators, mask)
-            lows.append(states.low)
-            highs.append(states.high)
-            states, bad = states.settled()
-            if bad is not None:
-                m = functions_of(bad)
-                lows[-1] = m.where(bad[:, None], -math.inf, lows[-1])
-                highs[-1] = m.where(bad[:, None], math.inf, highs[-1])
-        sides = [_in_batch(side, batch) for side in (lows, highs)]
+        sides = start.lower.reshape(-1, n), start.upper.reshape(-1, n)
+        low, high = sides if differentiated else (side.numpy() for side in sides)
+        steps = Steps(known, disturbance, batch, tensors=differentiated, watch=watch)
+        first = _Course(states, low, high, Boxed(self.symbols))
+        count = loop.horizon if horizon is None else horizon
+        # A cell has intervals at all steps or at none, so that its tube is the same whatever cells are beside it.
+        carrying = np.zeros_like(steps.every_cell) if intervals and not differentiated else None
+        course, length = first.copy(), 1
+        while course.step < count:
+            begin, traces = course.step, []
+            for k in range(begin, min(begin + length, count)):
+                sets = course.states, (course.low, course.high)
+                done = steps.evaluate(k, *sets, None if hints is None else hints[k], carrying)
+                course.take(done, keep_steps=keep_steps, symbols=self.symbols)
+                traces.append(done.trace)
+            missed = steps.check(begin, traces, carrying)
+            if carrying is not None and missed.cells.any():
+                carrying = carrying | missed.cells
+                course, length = first.copy(), 1
+                continue
+            course.sharpen(missed.watched)
+            length = min(8 * length, BLOCK)
         tube = Tube(
-            *(torch.cat([f[..., None, :], s], -2) for f, s in zip((start.lower, start.upper), sides, strict=True))
+            *(
+                torch.cat([f[..., None, :], _in_batch(s, batch)], -2)
+                for f, s in ((start.lower, course.lows), (start.upper, course.highs))
+            )
         )
-        low, high = [_in_batch(side, batch) for side in zip(*controls, strict=True)] or (None, None)
-        return AffineRun(tube, bands, masks, kept, low, high, boxed.notes(), states)
+        asked = [_in_batch(side, batch) for side in zip(*course.controls, strict=True)] or (None, None)
+        return AffineRun(tube, course.bands, course.masks, course.kept, *asked, course.boxed.notes(), course.states)
+
+
+@dataclass
+class _Course:
+    """How far a pass has come.
+
+    Attributes:
+        states: the set that was reached.
+        low, high: its bounds, which may be tighter, ``(B, n)``.
+        boxed: what boxing cost.
+        again: number of generators from which on it is looked for some to drop.
+        lows, highs, bands, masks, controls, kept: of the steps taken.
+    """
+
+    states: Zonotope
+    low: Any
+    high: Any
+    boxed: Boxed
+    again: int = 0
+    lows: list[Any] = field(default_factory=list)
+    highs: list[Any] = field(default_factory=list)
+    bands: list[list[tuple[str, Band]]] = field(default_factory=list)
+    masks: list[np.ndarray] = field(default_factory=list)
+    controls: list[tuple[Any, Any]] = field(default_factory=list)
+    kept: list[KeptStep] = field(default_factory=list)
+
+    @property
+    def step(self) -> int:
+        """Which one is next."""
+        return len(self.lows)
+
+    def copy(self) -> _Course:
+        """One that does not change with this."""
+        lists = {name: list(value) for name, value in vars(self).items() if isinstance(value, list)}
+        return dataclasses.replace(self, boxed=copy.copy(self.boxed), **lists)
+
+    def take(self, done: Done, *, keep_steps: bool, symbols: int | None) -> None:
+        """A step."""
+        frame, after, states = done.frame, done.after, done.states
+        self.bands.append([pair for r in frame.relaxed for pair in recorded_bands(r.name, r.band, r.turn)])
+        if done.watched is not None:
+            self.controls.append(done.watched)
+        if keep_steps:
+            self.kept.append(KeptStep.of(frame, after))
+        mask, n = np.ones(states.order, dtype=bool), states.dim
+        # Looking for generators to drop costs as much as a step: only when there are a good deal more than before.
+        if states.order > (self.again if symbols is None else max(symbols, n + 1)):
+            states, chosen = states.reduce_order(symbols)
+            mask = mask if chosen is None else chosen
+            self.again = max(states.order * 5 // 4, states.order + 64)
+        self.masks.append(mask)
+        if symbols is not None:
+            every = done.states.generators
+            self.boxed.follow(every if isinstance(every, np.ndarray) else every.detach(), mask)
+        self.low, self.high = done.low, done.high
+        self.states, bad = states.settled()
+        if bad is not None:  # what intervals know of them, if anything
+            m = functions_of(bad)
+            self.low = m.where(m.isnan(self.low), -math.inf, self.low)
+            self.high = m.where(m.isnan(self.high), math.inf, self.high)
+        self.lows.append(self.low)
+        self.highs.append(self.high)
+
+    def sharpen(self, controls: Sequence[tuple[Any, Any]]) -> None:
+        """Bounds of what is watched in the last steps, intersected with these."""
+        for i, (low, high) in enumerate(controls, start=len(self.controls) - len(controls)):
+            lower, upper = self.controls[i]
+            self.controls[i] = np.fmax(lower, low), np.fmin(upper, high)
 
 
 def _in_batch(steps: Sequence[Any], batch: torch.Size) -> Tensor:

@@ -171,7 +171,7 @@ def _attempt(
     guess = guess.expand(2, steps, cells, s, n)
     signal = [side.expand(steps, n)[:, None, None].expand(steps, cells, s, n) for side in (w.lower, w.upper)]
     sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
-    run = affine.run(part, start, Box(*sides), watch=True, states=states)
+    run = affine.run(part, start, Box(*sides), watch=True, states=states, intervals=False)
     state, control = _boxes(run, n, s)
     each = Box(*(side.transpose(0, 1).reshape(-1, n) for side in signal))
     found = enclosure(programs, state, control, w if w.lower.dim() == 1 else each)

@@ -1,4 +1,4 @@
-"""CROWN: linear bounds of every step's state, taken back to the start box.
+"""CROWN: linear bounds of every step's state, taken back to the start box, within those of a forward pass.
 
 The relaxations are those of one forward affine pass (:mod:`.affine.affine`), which bounds the inputs of
 all operations; then one backward sweep (:mod:`.crown.backward`) serves all steps. Unlike CROWN on the
@@ -22,6 +22,7 @@ from sagemp_cli.reachability.affine.compiled.operations import Relaxed
 from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.blocks import in_blocks, some_of
 from sagemp_cli.reachability.crown.backward import backward
+from sagemp_cli.reachability.crown.backward_steps import LINEAR
 from sagemp_cli.reachability.crown.steps import BLOCK, KEPT, MAKING, Steps
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
@@ -59,7 +60,7 @@ class Crown(Propagator):
 
         def bounded(some: RecordedLoop, cells: Box) -> Reach:
             run = Affine(symbols=self.symbols).run(some, cells, disturbance, keep_steps=True)
-            return Reach(taken_back(run, cells, rows=self.rows)[0], notes=run.notes)
+            return Reach(run.tube.intersected(taken_back(run, cells, rows=self.rows)[0]), notes=run.notes)
 
         return in_blocks(bounded, known, start, at_once=cells_at_once(self, known, start, disturbance))
 
@@ -129,7 +130,10 @@ def _hint(operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> Hint:
     if bounds is None:
         return hint
     low, high = _placed(center, *(side.reshape(center.shape) for side in bounds))
-    return hint._replace(lower=low, upper=high)
+    # Where a function is linear on its interval the backward pass asks for bounds only if it is not in another cell.
+    slope, offset, radius = (torch.from_numpy(part) for part in (*operation.band[:2], operation.radius))
+    needless = radius <= LINEAR * (slope.abs() * torch.from_numpy(operation.form.both[1]) + offset.abs())
+    return hint._replace(lower=torch.where(needless, -math.inf, low), upper=torch.where(needless, math.inf, high))
 
 
 def _placed(center: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,9 +1,14 @@
-"""Intervals: values that know two bounds per entry, both rounded outwards, and what instructions do to them."""
+"""Intervals: values that know two bounds per entry, both rounded outwards, and what instructions do to them.
+
+Bounds are tensors. What an instruction makes of two vectors takes numpy's arrays too, for the intervals that are
+carried beside affine forms (:mod:`.affine.compiled.intervals`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +16,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.program.kinds import join, pick
 from sagemp_cli.reachability.program.program import Instruction
+from sagemp_cli.reachability.relaxations.functions import contiguous, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.registry import relaxation
 from sagemp_cli.sets import round_down, round_up
 from sagemp_cli.sets.rounding import TINY, slack
@@ -21,12 +27,13 @@ class IntervalForm:
 
     __slots__ = ("lower", "upper")
 
-    def __init__(self, lower: Tensor, upper: Tensor) -> None:
-        self.lower = torch.nan_to_num(lower, nan=-math.inf, posinf=math.inf, neginf=-math.inf)
-        self.upper = torch.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=-math.inf)
+    def __init__(self, lower: Any, upper: Any) -> None:
+        m = functions_of(lower)
+        self.lower = m.nan_to_num(lower, nan=-math.inf, posinf=math.inf, neginf=-math.inf)
+        self.upper = m.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=-math.inf)
 
     @property
-    def bounds(self) -> tuple[Tensor, Tensor]:
+    def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bound."""
         return self.lower, self.upper
 
@@ -45,25 +52,26 @@ def evaluate(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
     if i.kind in _RULES:
         return _RULES[i.kind](*operands)
     if i.kind == "atan2":
-        sides = torch.broadcast_tensors(*operands[0].bounds, *operands[1].bounds)
-        return IntervalForm(*relaxation(i.kind).operation.value_range(*sides))
+        sides = functions_of(operands[0].lower).broadcast_tensors(*operands[0].bounds, *operands[1].bounds)
+        return IntervalForm(*on_tensors(relaxation(i.kind).operation.value_range, *map(contiguous, sides)))
     _, operation, parameters = relaxation(i.kind, i.constants)
     return IntervalForm(*operation.value_range(*operands[0].bounds, *parameters))
 
 
-def _outwards(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+def _outwards(lower: Any, upper: Any) -> tuple[Any, Any]:
     """Bounds that were rounded to nearest, moved to the next floats outside."""
     return round_down(lower), round_up(upper)
 
 
-def _signed(low: Tensor, high: Tensor, not_negative: Tensor, not_positive: Tensor) -> IntervalForm:
+def _signed(low: Any, high: Any, not_negative: Any, not_positive: Any) -> IntervalForm:
     """Bounds whose rounding does not cross 0 where the sign is known: there a root or a quotient has its end."""
+    m = functions_of(low)
     return IntervalForm(
-        torch.where(not_negative, low.clamp(min=0.0), low), torch.where(not_positive, high.clamp(max=0.0), high)
+        m.where(not_negative, m.clamp(low, min=0.0), low), m.where(not_positive, m.clamp(high, max=0.0), high)
     )
 
 
-def _signs(a: IntervalForm, b: IntervalForm) -> tuple[Tensor, Tensor]:
+def _signs(a: IntervalForm, b: IntervalForm) -> tuple[Any, Any]:
     """Where a product or quotient is not negative, and where it is not positive."""
     up_a, down_a, up_b, down_b = a.lower >= 0, a.upper <= 0, b.lower >= 0, b.upper <= 0
     return (up_a & up_b) | (down_a & down_b), (up_a & down_b) | (down_a & up_b)
@@ -78,23 +86,35 @@ def _negative(a: IntervalForm) -> IntervalForm:
     return IntervalForm(-a.upper, -a.lower)
 
 
-def _corners(corners: Any) -> tuple[Tensor, Tensor]:
-    values = torch.stack(torch.broadcast_tensors(*corners))
-    return values.amin(0), values.amax(0)
+def _corners(a: IntervalForm, b: IntervalForm, operation: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+    m = functions_of(a.lower)
+    values = m.stack([operation(x, y) for x in a.bounds for y in b.bounds])
+    return m.amin(values, 0), m.amax(values, 0)
 
 
 def _product(a: IntervalForm, b: IntervalForm) -> IntervalForm:
     """Product; of one value with itself the square."""
     if a is b:
-        return IntervalForm(*relaxation("pow", (torch.tensor(2.0),)).operation.value_range(*a.bounds, 2))
-    return _signed(*_outwards(*_corners(x * y for x in a.bounds for y in b.bounds)), *_signs(a, b))
+        _, square, parameters = relaxation("pow", (torch.tensor(2.0),))
+        return IntervalForm(*square.range_of(*a.bounds, *parameters))
+    return _signed(*_outwards(*_corners(a, b, operator.mul)), *_signs(a, b))
 
 
 def _quotient(a: IntervalForm, b: IntervalForm) -> IntervalForm:
     """Quotient; unbounded where the denominator may be 0."""
-    pole = (b.lower <= 0) & (b.upper >= 0)
-    found = _signed(*_outwards(*_corners(x / y for x in a.bounds for y in b.bounds)), *_signs(a, b))
-    return IntervalForm(torch.where(pole, -math.inf, found.lower), torch.where(pole, math.inf, found.upper))
+    pole, m = (b.lower <= 0) & (b.upper >= 0), functions_of(a.lower)
+    found = _signed(*_outwards(*_corners(a, b, operator.truediv)), *_signs(a, b))
+    return IntervalForm(m.where(pole, -math.inf, found.lower), m.where(pole, math.inf, found.upper))
+
+
+def _larger(a: IntervalForm, b: IntervalForm) -> IntervalForm:
+    m = functions_of(a.lower)
+    return IntervalForm(m.maximum(a.lower, b.lower), m.maximum(a.upper, b.upper))
+
+
+def _smaller(a: IntervalForm, b: IntervalForm) -> IntervalForm:
+    m = functions_of(a.lower)
+    return IntervalForm(m.minimum(a.lower, b.lower), m.minimum(a.upper, b.upper))
 
 
 def _linear(x: IntervalForm, weight: Tensor, bias: Tensor) -> IntervalForm:
@@ -117,6 +137,6 @@ _RULES = {
     "sub": lambda a, b: _sum(a, _negative(b)),
     "mul": _product,
     "div": _quotient,
-    "maximum": lambda a, b: IntervalForm(torch.maximum(a.lower, b.lower), torch.maximum(a.upper, b.upper)),
-    "minimum": lambda a, b: IntervalForm(torch.minimum(a.lower, b.lower), torch.minimum(a.upper, b.upper)),
+    "maximum": _larger,
+    "minimum": _smaller,
 }

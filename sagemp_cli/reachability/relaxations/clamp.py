@@ -8,11 +8,13 @@ kinks; higher than either, it rises.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import Band, settled
+from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.sets.rounding import TINY, slack
 
@@ -42,7 +44,13 @@ def lines(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float 
 def value_range(
     lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Bounds on ``[lower, upper]``, exact; of an unknown argument the limits."""
+    """Bounds on ``[lower, upper]``, exact; of an unknown argument the limits; of tensors or of arrays."""
+    m = functions_of(lower)
+    if m is not torch:
+        low, high = (limit if isinstance(limit, float) else limit.numpy() for limit in (minimum, maximum))
+        unknown = np.isnan(lower) | np.isnan(upper)
+        lower, upper = np.where(unknown, -np.inf, lower), np.where(unknown, np.inf, upper)
+        return np.minimum(np.maximum(lower, low), high), np.minimum(np.maximum(upper, low), high)
     lower = torch.nan_to_num(lower, nan=-torch.inf, posinf=torch.inf, neginf=-torch.inf)
     upper = torch.nan_to_num(upper, nan=torch.inf, posinf=torch.inf, neginf=-torch.inf)
     return _clamp(lower, minimum, maximum), _clamp(upper, minimum, maximum)

@@ -32,22 +32,36 @@ def on_tensors(function: Callable[..., Any], *arguments: Any) -> Any:
     return parts if type(answer) is tuple else type(answer)(*parts)
 
 
+def contiguous(x: Any) -> Any:
+    """The same with its entries side by side."""
+    return x.contiguous() if isinstance(x, Tensor) else np.ascontiguousarray(x)
+
+
 def constant(x: Any) -> Any:
     """A context in which what is computed from x is a constant for autograd."""
     return torch.no_grad() if isinstance(x, Tensor) else contextlib.nullcontext()
 
 
 class _Numpy:
-    where, maximum, minimum, fmax, copysign = np.where, np.maximum, np.minimum, np.fmax, np.copysign
+    where, maximum, minimum, fmax, fmin, copysign = np.where, np.maximum, np.minimum, np.fmax, np.fmin, np.copysign
     sin, cos, acos, asin, sqrt = np.sin, np.cos, np.arccos, np.arcsin, np.sqrt
     ceil, floor, round, isfinite, cat = np.ceil, np.floor, np.rint, np.isfinite, np.concatenate
-    zeros_like, ones_like, full_like, nan_to_num = np.zeros_like, np.ones_like, np.full_like, np.nan_to_num
+    zeros_like, ones_like, full_like = np.zeros_like, np.ones_like, np.full_like
+    isnan = np.isnan
     amax, amin, any, all = np.maximum.reduce, np.minimum.reduce, np.any, np.all
 
     @staticmethod
     def clamp(x: np.ndarray, min: float | None = None, max: float | None = None) -> np.ndarray:  # noqa: A002
         x = x if min is None else np.maximum(x, min)
         return x if max is None else np.minimum(x, max)
+
+    @staticmethod
+    def nan_to_num(x: np.ndarray, **values: float) -> np.ndarray:
+        return x if math.isfinite(x.sum()) else np.nan_to_num(x, **values)
+
+    @staticmethod
+    def broadcast_tensors(*arrays: Any) -> Any:
+        return np.broadcast_arrays(*arrays)
 
     @staticmethod
     def stack(arrays: Any) -> np.ndarray:

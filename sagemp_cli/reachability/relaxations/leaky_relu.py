@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ from sagemp_cli.reachability.relaxations import lines as _lines
 from sagemp_cli.reachability.relaxations.band import Band, settled
 from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.reachability.relaxations.lines import Lines
-from sagemp_cli.reachability.relaxations.value_range import increasing, outward
+from sagemp_cli.reachability.relaxations.value_range import outward
 from sagemp_cli.sets.rounding import TINY, gamma
 
 
@@ -38,13 +40,13 @@ def lines(lower: Tensor, upper: Tensor, negative_slope: float) -> Lines:
 
 def value_range(lower: Tensor, upper: Tensor, negative_slope: float) -> tuple[Tensor, Tensor]:
     """Bounds on ``[lower, upper]``: monotone for ``s >= 0``; V-shaped for ``s < 0``, least at the kink."""
-    leaky = torch.nn.functional.leaky_relu
+    m = functions_of(lower)
+    first, last = m.maximum(lower, negative_slope * lower), m.maximum(upper, negative_slope * upper)
     if negative_slope >= 0:
-        low, high = increasing(lambda x: leaky(x, negative_slope), lower, upper, ulps=1)
-        return torch.where(lower >= 0, lower, low if negative_slope else low.clamp(min=0.0)), high
-    ends = torch.stack([leaky(lower, negative_slope), leaky(upper, negative_slope)])
-    least = torch.where((lower <= 0) & (upper >= 0), torch.zeros_like(lower), ends.amin(0))
-    return outward(least, ends.amax(0), ulps=1, floor=0.0)
+        low, high = outward(first, last, ulps=1, floor=-math.inf if negative_slope else 0.0)
+        return m.where(lower >= 0, lower, low), high
+    least = m.where((lower <= 0) & (upper >= 0), 0.0, m.minimum(first, last))
+    return outward(least, m.maximum(first, last), ulps=1, floor=0.0)
 
 
 def _chord_and_gap(lower: Tensor, upper: Tensor, negative_slope: float, slope: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -40,12 +40,14 @@ class Operation(NamedTuple):
         lines: one below and one above.
         value_range: of the values.
         arrays: whether the band takes numpy's arrays too.
+        ranges: whether the value range does.
     """
 
     band: Callable[..., Band]
     lines: Callable[..., Lines]
     value_range: Callable[..., tuple[Tensor, Tensor]]
     arrays: bool = False
+    ranges: bool = False
 
     def band_of(self, lower: Any, upper: Any, *parameters: Any) -> Band:
         """The band, of tensors as tensors and of arrays as arrays."""
@@ -55,14 +57,20 @@ class Operation(NamedTuple):
         rest = parameters[len(given) :]
         return on_tensors(lambda low, high, *arrays: self.band(low, high, *arrays, *rest), lower, upper, *given)
 
+    def range_of(self, lower: Any, upper: Any, *parameters: Any) -> tuple[Any, Any]:
+        """Bounds of the values, of tensors as tensors and of arrays as arrays."""
+        if self.ranges or isinstance(lower, Tensor):
+            return self.value_range(lower, upper, *parameters)
+        return on_tensors(lambda low, high: self.value_range(low, high, *parameters), lower, upper)
 
-def _of(module: ModuleType, *, arrays: bool = False) -> Operation:
-    return Operation(module.band, module.lines, module.value_range, arrays)
+
+def _of(module: ModuleType, *, arrays: bool = False, ranges: bool = False) -> Operation:
+    return Operation(module.band, module.lines, module.value_range, arrays, ranges)
 
 
 OPERATIONS: dict[str, Operation] = {
-    "sin": Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range, arrays=True),
-    "cos": Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range, arrays=True),
+    "sin": Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range, arrays=True, ranges=True),
+    "cos": Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range, arrays=True, ranges=True),
     "tan": _of(_tangent),
     "atan": _of(_arctangent),
     "tanh": _of(_tanh),
@@ -73,13 +81,13 @@ OPERATIONS: dict[str, Operation] = {
     "sqrt": _of(_square_root),
     "abs": _of(_absolute),
     "reciprocal": _of(_reciprocal, arrays=True),
-    "relu": _of(_leaky_relu, arrays=True),
-    "leaky_relu": _of(_leaky_relu, arrays=True),
+    "relu": _of(_leaky_relu, arrays=True, ranges=True),
+    "leaky_relu": _of(_leaky_relu, arrays=True, ranges=True),
     "elu": _of(_elu),
     "softplus": _of(_softplus),
     "pow": _of(_power),
-    "clamp": _of(_clamp),
-    "identity": _of(_identity, arrays=True),
+    "clamp": _of(_clamp, ranges=True),
+    "identity": _of(_identity, arrays=True, ranges=True),
     "atan2": _of(_arctangent2),
 }
 """Of every kind that is not linear, but products and quotients."""

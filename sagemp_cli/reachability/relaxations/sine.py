@@ -174,14 +174,14 @@ def _lines_of(wave: _Wave, lower: Tensor, upper: Tensor) -> Lines:
 
 
 def _range(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    ends = torch.stack([lower, upper])
-    tops, bottoms, _ = _extrema(wave, torch.zeros_like(lower), ends, wave.value(ends))
-    near = ends.abs().amax(0) <= _FAR
-    margin = _margin(torch.zeros_like(lower))
-    one = torch.ones_like(lower)
+    m = functions_of(lower)
+    ends, zero = m.stack([lower, upper]), m.zeros_like(lower)
+    tops, bottoms, _ = _extrema(wave, zero, ends, wave.value(ends))
+    near = m.amax(abs(ends), 0) <= _FAR
+    margin = _margin(zero)
     return (
-        torch.where(near, torch.maximum(bottoms.amin(0) - margin, -one), -one),
-        torch.where(near, torch.minimum(tops.amax(0) + margin, one), one),
+        m.where(near, m.clamp(m.amin(bottoms, 0) - margin, min=-1.0), -1.0),
+        m.where(near, m.clamp(m.amax(tops, 0) + margin, max=1.0), 1.0),
     )
 
 

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
-import torch
 from torch import Tensor
 
+from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.sets.rounding import TINY, gamma
 
 
-def outward(least: Tensor, most: Tensor, *, ulps: float, floor: float = -math.inf) -> tuple[Tensor, Tensor]:
+def outward(least: Any, most: Any, *, ulps: float, floor: float = -math.inf) -> tuple[Any, Any]:
     """Computed extremes moved outwards by their error (``ulps`` of 2^-52) and underflow; NaN becomes infinite.
 
-    But not below the floor, a bound of all values: the domains of roots and quotients begin at 0 exactly.
+    But not below the floor, a bound of all values: the domains of roots and quotients begin at 0 exactly. Of tensors or
+    of arrays.
     """
-    margin = gamma(2 * ulps + 1)
-    low = torch.nan_to_num(least - (least.abs() * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
-    high = torch.nan_to_num(most + (most.abs() * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf)
-    return low.clamp(min=floor), high
+    margin, m = gamma(2 * ulps + 1), functions_of(least)
+    low = m.nan_to_num(least - (abs(least) * margin + TINY), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
+    high = m.nan_to_num(most + (abs(most) * margin + TINY), nan=math.inf, posinf=math.inf, neginf=-math.inf)
+    return m.clamp(low, min=floor), high
 
 
 def increasing(

@@ -104,10 +104,10 @@ def test_bounds_of_another_operation_are_refused():
 @torch.no_grad()
 def test_bounds_across_a_direction_are_used_across_that_direction():
     start, w = Box.around([2.485], [1.165]), Box.around([0.0], [0.0])
-    first = Affine().run(Angle(), start, w, keep_steps=True)
+    first = Affine().run(Angle(), start, w, keep_steps=True, intervals=False)
     _, hints = taken_back(first, start, rows=64, inputs=True)
     kept, anew = (
-        Affine().run(Angle(), start, w, keep_steps=True, hints=[h]).steps[0].relaxed[-1]
+        Affine().run(Angle(), start, w, keep_steps=True, hints=[h], intervals=False).steps[0].relaxed[-1]
         for h in (hints[0], [h._replace(turn=None) for h in hints[0]])
     )
     assert hints[0][-1].name == kept.name == "atan2"

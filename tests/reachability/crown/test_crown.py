@@ -39,7 +39,7 @@ def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monk
         (unicycle_loop(line(0.3)), START, DISTURBANCE),
         (EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.1] * 3), Box.around([0.0] * 3, [0.01] * 3)),
     ):
-        run = Affine().run(loop, start, w, keep_steps=True)
+        run = Affine().run(loop, start, w, keep_steps=True, intervals=False)
         low, high = _swept(Steps(run.steps), start.radius, range(loop.horizon), False, False).state
         torch.testing.assert_close(high - low, run.tube.width[1:], rtol=1e-7, atol=1e-12)
 

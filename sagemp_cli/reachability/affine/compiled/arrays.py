@@ -51,8 +51,3 @@ def like(tensor: Tensor, x: Any) -> Any:
     """A tensor in the shape of the other, as an array if that is one."""
     shaped = tensor.reshape(x.shape)
     return shaped if isinstance(x, Tensor) else shaped.numpy()
-
-
-def contiguous(x: Any) -> Any:
-    """The same with its entries side by side."""
-    return x.contiguous() if isinstance(x, Tensor) else np.ascontiguousarray(x)

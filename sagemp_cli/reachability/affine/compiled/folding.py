@@ -25,7 +25,7 @@ from sagemp_cli.reachability.program.program import Instruction, Outputs, Progra
 from sagemp_cli.reachability.relaxations.registry import Relaxation, relaxation
 from sagemp_cli.sets.rounding import TINY, dot, gamma
 
-Rule = Literal["function", "product", "quotient", "angle"]
+Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum"]
 
 
 class Combination(NamedTuple):
@@ -34,11 +34,14 @@ class Combination(NamedTuple):
     Attributes:
         matrix, sizes: ``(rows, columns)``; columns are 1, numbers, states, disturbances, results; those to come are 0.
         error: of an entry of the matrix, relative to that of ``sizes``.
+        copies: which rows are one of the basic values, or minus one, and so are not rounded at all, ``(rows, 1)``; None
+            if none is.
     """
 
     matrix: Tensor
     sizes: Tensor
     error: float = 0.0
+    copies: Tensor | None = None
 
     @staticmethod
     def constant(value: Tensor) -> Combination:
@@ -47,12 +50,16 @@ class Combination(NamedTuple):
 
     def moved(self, map_: Callable[[Tensor], Tensor]) -> Combination:
         """What a map that only moves rows makes of it (exact)."""
-        return Combination(map_(self.matrix), map_(self.sizes), self.error)
+        copies = None if self.copies is None else map_(self.copies)
+        return Combination(map_(self.matrix), map_(self.sizes), self.error, copies)
 
     def padded(self, columns: int) -> Combination:
         """With as many columns."""
         missing = columns - self.matrix.shape[-1]
-        return self.moved(lambda t: pad(t, (0, missing))) if missing else self
+        if not missing:
+            return self
+        matrix, sizes = (pad(t, (0, missing)) for t in self[:2])
+        return Combination(matrix, sizes, self.error, self.copies)
 
 
 class Node(NamedTuple):
@@ -60,16 +67,18 @@ class Node(NamedTuple):
 
     Attributes:
         rule: "function", of one variable; "product"; "quotient", whose third operand is the reciprocal of the second;
-            or "angle", whose operands are y and x.
+            "angle", whose operands are y and x; "maximum" or "minimum" of a and b, whose operands are a - b, a and b.
         operands: its operands, one after the other.
         size: entries of its result.
-        relaxation: of a function or an angle.
+        relaxation: of a function or an angle; of a maximum or minimum that of ``relu(a - b)``.
+        square: whether a product is of one value with itself.
     """
 
     rule: Rule
     operands: Combination
     size: int
     relaxation: Relaxation | None = None
+    square: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,17 +139,19 @@ class _Folding:
     def _basic(self, size: int) -> Combination:
         first, self._columns = self._columns, self._columns + size
         rows = torch.eye(self._columns, dtype=torch.float64)[first:]
-        return Combination(rows, rows)
+        return Combination(rows, rows, copies=torch.ones(size, 1, dtype=torch.bool))
 
-    def _node(self, rule: Rule, size: int, operands: Combination, how: Relaxation | None = None) -> Combination:
-        self._nodes.append(Node(rule, operands, size, how))
+    def _node(
+        self, rule: Rule, size: int, operands: Combination, how: Relaxation | None = None, *, square: bool = False
+    ) -> Combination:
+        self._nodes.append(Node(rule, operands, size, how, square))
         return self._basic(size)
 
     def _evaluated(self, i: Instruction, operands: Sequence[Combination]) -> Combination:
         if i.kind in ("constant", "pick", "join", "linear"):
             return self._linear(i, operands)
         if i.kind == "neg":
-            return Combination(-operands[0].matrix, operands[0].sizes, operands[0].error)
+            return operands[0]._replace(matrix=-operands[0].matrix)
         if len(operands) == 1:
             return self._node("function", i.size, operands[0], relaxation(i.kind, i.constants))
         a, b = (o if len(o.matrix) == i.size else o.moved(lambda t: t.expand(i.size, -1)) for o in operands)
@@ -150,9 +161,9 @@ class _Folding:
         if i.kind == "mul":
             if any(constant):
                 return _scaled(a, b) if constant[1] else _scaled(b, a)
-            return self._node("product", i.size, _joined([a, b]))
+            return self._node("product", i.size, _joined([a, b]), square=operands[0] is operands[1])
         if i.kind == "div":
-            return self._quotient(i, a, b, constant)
+            return self._quotient(i, a, b, operands[1], constant)
         if i.kind == "atan2":
             return self._node("angle", i.size, _joined([a, b]), relaxation(i.kind))
         return self._extreme(i, a, b, constant)
@@ -171,17 +182,23 @@ class _Folding:
         y = Combination(weight @ x.matrix, sizes + _tiny(sizes), x.error + dot(weight.shape[-1]))
         return _sum(y, Combination.constant(bias)) if bool(bias.any()) or bias.requires_grad else y
 
-    def _quotient(self, i: Instruction, a: Combination, b: Combination, constant: Sequence[bool]) -> Combination:
+    def _quotient(
+        self, i: Instruction, a: Combination, b: Combination, divisor: Combination, constant: Sequence[bool]
+    ) -> Combination:
+        """Of one divisor for all entries there is one reciprocal."""
         if constant[1]:
             value = b.matrix[:, :1]
             return Combination(a.matrix / value, a.sizes / value.abs() + _tiny(a.sizes), a.error + gamma(1))
-        reciprocal = self._node("function", i.size, b, relaxation("reciprocal"))
+        count = len(divisor.matrix)
+        reciprocal = self._node("function", count, divisor, relaxation("reciprocal"))
+        if count != i.size:
+            reciprocal = reciprocal.moved(lambda t: t.expand(i.size, -1))
         if constant[0]:
             return _scaled(reciprocal, a)
         return self._node("quotient", i.size, _joined([a, b, reciprocal]))
 
     def _extreme(self, i: Instruction, a: Combination, b: Combination, constant: Sequence[bool]) -> Combination:
-        """``maximum`` is ``b + relu(a - b)`` and ``minimum`` is ``a - relu(a - b)``: what both share cancels."""
+        """With a fixed number a clamp; else one operation, in whose ``a - b`` what both share cancels."""
         largest = i.kind == "maximum"
         if any(constant):
             value, limit = (a, b) if constant[1] else (b, a)
@@ -189,8 +206,8 @@ class _Folding:
             none = torch.full_like(limit, -torch.inf if largest else torch.inf)
             limits = (limit, -none) if largest else (-none, limit)
             return self._node("function", i.size, value, relaxation("clamp", limits))
-        relu = self._node("function", i.size, _sum(a, b, -1.0), relaxation("relu"))
-        return _sum(b, relu) if largest else _sum(a, relu, -1.0)
+        rule: Rule = "maximum" if largest else "minimum"
+        return self._node(rule, i.size, _joined([_sum(a, b, -1.0), a, b]), relaxation("relu"))
 
 
 def _is_constant(a: Combination) -> bool:
@@ -201,7 +218,9 @@ def _joined(parts: Sequence[Combination]) -> Combination:
     """One after the other."""
     columns = max(part.matrix.shape[-1] for part in parts)
     rows = [part.padded(columns) for part in parts]
-    return Combination(torch.cat([r[0] for r in rows]), torch.cat([r[1] for r in rows]), max(r.error for r in rows))
+    copies = torch.cat([torch.zeros(len(r[0]), 1, dtype=torch.bool) if r.copies is None else r.copies for r in rows])
+    matrix, sizes = (torch.cat([r[i] for r in rows]) for i in range(2))
+    return Combination(matrix, sizes, max(r.error for r in rows), copies)
 
 
 def _sum(a: Combination, b: Combination, sign: float = 1.0) -> Combination:

@@ -21,15 +21,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sagemp_cli.reachability.affine.compiled.arrays import contiguous, like, with_fresh
+from sagemp_cli.reachability.affine.compiled.arrays import added, like, with_fresh
 from sagemp_cli.reachability.affine.compiled.folding import Node
 from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints, hint_of
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
-from sagemp_cli.reachability.relaxations.functions import constant, functions_of, on_tensors
+from sagemp_cli.reachability.relaxations.functions import constant, contiguous, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
-from sagemp_cli.sets.rounding import BAND, ROUNDED, SAFETY, SHIFT, TINY, of_generators, of_product, over_symbols
+from sagemp_cli.sets.rounding import BAND, ROUNDED, SAFETY, SHIFT, SUM, TINY, of_generators, of_product, over_symbols
 from sagemp_cli.sets.zonotope import Zonotope
 
 Array = Any  # of numpy or of torch, which have no type in common: functions_of does the same to both
@@ -60,6 +60,7 @@ class Factors(NamedTuple):
         radius_x, radius_y: of ``|X|`` and ``|Y|``.
         middle: what the product's form counts of ``X Y`` itself; the rest is its error.
         magnitude_x, magnitude_y: of the factors.
+        centers: of the factors, one after the other, ``(B, 2E)``.
     """
 
     x: Array
@@ -72,6 +73,13 @@ class Factors(NamedTuple):
     middle: Array
     magnitude_x: Array
     magnitude_y: Array
+    centers: Array
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of both factors, one after the other, ``(B, 2E)``, rounding included."""
+        radius = functions_of(self.centers).cat([self.radius_x, self.radius_y], -1)
+        return self.centers - radius, self.centers + radius
 
     @property
     def sum(self) -> Array:
@@ -136,6 +144,8 @@ class Frame:
         both: centre and magnitude of the states, ``(2, B, n)``.
         size: number of variables so far.
         relaxed: the operations so far.
+        within: bounds of the operands of the operation whose turn it is, by intervals, ``(B, operands)``; None if
+            nothing is known.
     """
 
     def __init__(self, states: Zonotope, *, inputs: int, own_radius: Array, hints: Hints | None = None) -> None:
@@ -144,6 +154,7 @@ class Frame:
         self.states, self.hints, self.own_radius = states, hints, own_radius
         self.size = inputs
         self.relaxed: list[Relaxed] = []
+        self.within: tuple[Array, Array] | None = None
 
     @property
     def sum_error(self) -> float:
@@ -200,6 +211,18 @@ class Frame:
         radius = self.reach(x)
         return x.both[0] - radius, x.both[0] + radius
 
+    def operand_bounds(self, x: Value) -> tuple[Array, Array]:
+        """Bounds of the operand, or the first operands, of the operation whose turn it is: by form and by interval."""
+        return self.both_hold(*self.bounds(x))
+
+    def both_hold(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Bounds of the first operands, intersected with their intervals; what is no number says nothing."""
+        if self.within is None:
+            return lower, upper
+        m = functions_of(lower)
+        low, high = (side[:, : lower.shape[-1]] for side in self.within)
+        return m.fmax(lower, low), m.fmin(upper, high)
+
     def hint(self, name: str, size: int, after: Sequence[tuple[str, int]] = ()) -> Hint | None:
         """What is known of the next operation, or of the one that comes after these."""
         if self.hints is None:
@@ -212,6 +235,13 @@ class Frame:
         coefficients = with_fresh(coefficients, factor, self.size, relaxed.radius)
         self.size += relaxed.radius.shape[-1]
         return Value(self._m.stack([center, magnitude + relaxed.radius]), coefficients, BAND)
+
+
+def noticeably(node: Node, lower: Array, upper: Array, low: Array, high: Array) -> Array:
+    """In which cells the second bounds of an operand, within the first, are noticeably tighter anywhere, ``(B,)``."""
+    kinked = node.relaxation is not None and node.relaxation.name in KINKED
+    part = NOTICEABLE_AT_A_KINK if kinked else NOTICEABLE
+    return ~(high - low >= (upper - lower) * part - ROUNDING * (abs(lower) + abs(upper))).all(-1)
 
 
 class Bounded(NamedTuple):
@@ -237,7 +267,7 @@ def _function(node: Node, frame: Frame, x: Value) -> Value:
     """A function of one variable: its band over the operand's bounds."""
     assert node.relaxation is not None
     name, operation, parameters = node.relaxation
-    lower, upper = _narrowed(*frame.bounds(x), frame.hint(name, node.size))
+    lower, upper = _narrowed(*frame.operand_bounds(x), frame.hint(name, node.size))
     return enclosed(node, frame, Bounded(x, lower, upper, operation.band_of(lower, upper, *parameters)))
 
 
@@ -245,7 +275,7 @@ def sine_and_cosine_operands(node: Node, after: Node, frame: Frame, x: Value) ->
     """Of a sine and the cosine that follows it, or the other way round."""
     assert node.relaxation is not None and after.relaxation is not None
     name = node.relaxation.name
-    bounds, other = frame.bounds(x), after.relaxation.name
+    bounds, other = frame.operand_bounds(x), after.relaxation.name
     hints = frame.hint(name, node.size), frame.hint(other, node.size, [(name, node.size)])
     both = [_narrowed(*bounds, hint) for hint in hints]
     if not isinstance(bounds[0], np.ndarray):
@@ -270,9 +300,15 @@ def enclosed(node: Node, frame: Frame, operand: Bounded) -> Value:
     return frame.result(relaxed, x.both[0] * slope + offset, magnitude, x.coefficients, slope[..., None])
 
 
-def _ends(frame: Frame, operands: Value, size: int) -> tuple[Array, Array, Array, Array, Array]:
+def _ends(
+    frame: Frame, operands: Value, size: int, *, within: bool = False
+) -> tuple[Array, Array, Array, Array, Array]:
     """Of two vectors X and Y one after the other: radii of both, ``l = sqrt(r_Y / r_X)``, and bounds of
     ``|l X + Y / l|`` and ``|l X - Y / l|``. The scale is a constant for autograd.
+
+    Args:
+        frame, operands, size: what, and entries of one of them.
+        within: whether these are the operands of the operation whose turn it is.
     """
     m, arrays = functions_of(operands.both), isinstance(operands.both, np.ndarray)
     # Rounding of the sums, and of scaling (3 more units) is within twice the usual slack.
@@ -280,6 +316,11 @@ def _ends(frame: Frame, operands: Value, size: int) -> tuple[Array, Array, Array
     # Tensors are better summed from one product with the generators, arrays in blocks.
     parts = operands.coefficients if arrays else frame.rows(operands.coefficients)
     radius = (frame.radius(parts) if arrays else abs(parts).sum(-1)) + slack
+    by_intervals = within and frame.within is not None
+    if by_intervals:  # X is off by the form's own rounding, which is in the slack
+        center = operands.both[0]
+        low, high = frame.both_hold(center - radius, center + radius)
+        radius = m.fmin(radius, m.maximum(high - center, center - low) * SAFETY + slack)
     radius_x, radius_y = radius[:, :size], radius[:, size:]
     with constant(radius):
         ratio = m.sqrt(radius_y / radius_x)
@@ -287,10 +328,14 @@ def _ends(frame: Frame, operands: Value, size: int) -> tuple[Array, Array, Array
     doubt = (slack[:, :size] * ratio + slack[:, size:] / ratio) * SAFETY
     both = m.cat([x + y, x - y], -2)
     ends = frame.radius(both) if arrays else abs(both).sum(-1)
-    return radius_x, radius_y, ratio, ends[:, :size] + doubt, ends[:, size:] + doubt
+    plus, minus = ends[:, :size] + doubt, ends[:, size:] + doubt
+    if by_intervals:
+        most = (radius_x * ratio + radius_y / ratio) * SAFETY
+        plus, minus = m.fmin(plus, most), m.fmin(minus, most)
+    return radius_x, radius_y, ratio, plus, minus
 
 
-def _product(node: Node, frame: Frame, operands: Value) -> Value:
+def _product(node: Node, frame: Frame, operands: Value, *, within: bool = True) -> Value:
     """The product of the first half of the entries and the second, whose deviations may be correlated.
 
     ``(c + X)(d + Y) = c d + c Y + d X + X Y`` and, with ``P = l X + Y / l`` and ``M = l X - Y / l`` for any l > 0,
@@ -299,7 +344,7 @@ def _product(node: Node, frame: Frame, operands: Value) -> Value:
     """
     m, size, error = functions_of(operands.both), node.size, operands.error
     gx, gy = operands.coefficients[:, :size], operands.coefficients[:, size:]
-    radius_x, radius_y, ratio, plus, minus = _ends(frame, operands, size)
+    radius_x, radius_y, ratio, plus, minus = _ends(frame, operands, size, within=within)
     high, low = plus * plus * 0.25, minus * minus * 0.25
     middle, half = 0.5 * (high - low), 0.5 * (high + low)
     (c, mx), (d, my) = operands.both[..., :size], operands.both[..., size:]
@@ -311,7 +356,7 @@ def _product(node: Node, frame: Frame, operands: Value) -> Value:
         half * SAFETY + magnitude * (of_product(error) * SAFETY),
         frame.size,
         Value(m.stack([center, magnitude]), coefficients, error),
-        factors=Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my),
+        factors=Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my, operands.both[0]),
     )
     return frame.result(relaxed, center, magnitude, coefficients, 1.0)
 
@@ -329,15 +374,28 @@ def _quotient(node: Node, frame: Frame, operands: Value) -> Value:
         m.cat([of_a - q[..., None] * of_b, rest], -2),
         operands.error + SHIFT,
     )
-    product = _product(node, frame, factors)
+    product = _product(node, frame, factors, within=False)
     return Value(product.both + m.stack([q, abs(q)]), product.coefficients, product.error + SHIFT)
+
+
+def _extreme(node: Node, frame: Frame, operands: Value) -> Value:
+    """``maximum(a, b)`` is ``b + relu(a - b)`` and ``minimum(a, b)`` is ``a - relu(a - b)``."""
+    m, size, largest = functions_of(operands.both), node.size, node.rule == "maximum"
+    difference = Value(operands.both[..., :size], operands.coefficients[:, :size], operands.error)
+    above = _function(node, frame, difference)
+    other = slice(2 * size, None) if largest else slice(size, 2 * size)
+    sign = 1.0 if largest else -1.0
+    center, magnitude = operands.both[..., other]
+    both = m.stack([center + sign * above.both[0], magnitude + above.both[1]])
+    coefficients = added(sign * above.coefficients, operands.coefficients[:, other])
+    return Value(both, coefficients, max(operands.error, above.error) + SUM)
 
 
 def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     """The angle of a point, of its distance across a direction in the middle of its angles."""
     assert node.relaxation is not None
     m, size, hint = functions_of(operands.both), node.size, frame.hint("atan2", node.size)
-    lower, upper = frame.bounds(operands)
+    lower, upper = frame.operand_bounds(operands)
     sides = (lower[:, :size], upper[:, :size], lower[:, size:], upper[:, size:])
     low, high = on_tensors(_arctangent2.value_range, *map(contiguous, sides))
     if hint is None or hint.turn is None:
@@ -364,6 +422,12 @@ def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     return enclosed(node, frame, Bounded(across, lower, upper, band, given, turn))
 
 
+KINKED = ("relu", "leaky_relu", "clamp", "abs")
+NOTICEABLE_AT_A_KINK, NOTICEABLE = 0.9, 0.65
+"""What part of a form's width an operand's interval has at most where it is worth the time: errors at a kink are of
+first order in that width, those of all else of second."""
+ROUNDING = 1e-10
+"""A width this small, relative to the values, may be rounding only."""
 _BLOCK = 2**16
 """Entries of an array that stays in the processor's cache."""
 _ONES = np.ones(_BLOCK)
@@ -372,4 +436,6 @@ EVALUATE: dict[str, Callable[[Node, Frame, Value], Value]] = {
     "product": _product,
     "quotient": _quotient,
     "angle": _angle,
+    "maximum": _extreme,
+    "minimum": _extreme,
 }

@@ -10,10 +10,11 @@ taken, with or without fused multiply-add.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,17 +22,18 @@ from torch import Tensor
 
 from sagemp_cli.reachability.affine.compiled.arrays import added, repeated
 from sagemp_cli.reachability.affine.compiled.folding import Combination, Compiled, Node, compiled
-from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints
+from sagemp_cli.reachability.affine.compiled.hints import Hints
+from sagemp_cli.reachability.affine.compiled.intervals import Carried, Intervals
 from sagemp_cli.reachability.affine.compiled.operations import (
     EVALUATE,
     Bounded,
     Frame,
+    Relaxed,
     Value,
     enclosed,
+    noticeably,
     sine_and_cosine_operands,
 )
-from sagemp_cli.reachability.interval.form import IntervalForm
-from sagemp_cli.reachability.interval.operands import operands, sharper
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.relaxations.functions import functions_of
@@ -40,47 +42,153 @@ from sagemp_cli.sets.rounding import TINY, combined
 from sagemp_cli.sets.zonotope import Zonotope
 
 Array = np.ndarray | Tensor
+Sides = tuple[Any, Any]
+"""Lower and upper bounds, ``(B, entries)`` each."""
+
+
+class Done(NamedTuple):
+    """What a step gave.
+
+    Attributes:
+        frame: of the step.
+        after: the next state.
+        states: the set after it; its box may reach past ``low`` and ``high``.
+        low, high: bounds of the next state, ``(B, n)``.
+        watched: bounds of control and deviation, ``(B, m)`` each; None unless asked for and said by the loop.
+        form: of the same; None unless said by the loop.
+        trace: of it what a check needs.
+    """
+
+    frame: Frame
+    after: Value
+    states: Zonotope
+    low: Array
+    high: Array
+    watched: Sides | None
+    form: Value | None
+    trace: Trace
+
+
+class Trace(NamedTuple):
+    """What is kept of a step until it is checked.
+
+    Attributes:
+        before: bounds of the states before, ``(B, n)`` each.
+        operands: bounds of the operands of all operations by their forms, as far as they are known; none at all where
+            intervals were carried in every cell.
+        after: bounds of the next state by its form.
+    """
+
+    before: Sides
+    operands: list[Sides | None]
+    after: Sides
+
+
+class Missed(NamedTuple):
+    """What intervals know of steps that were taken without them.
+
+    Attributes:
+        cells: where they are tighter, ``(B,)``.
+        watched: bounds of control and deviation, ``(B, m)`` each, of every step; none unless asked for.
+    """
+
+    cells: np.ndarray
+    watched: Sequence[Sides]
+
+
+BLOCK = 64
+"""Steps that are taken by forms alone, at most, before they are checked against intervals."""
+
+NOTHING = 1e-11
+"""How much tighter than a form an interval may be by rounding, relative to the values."""
 
 
 class Steps:
     """The steps of a recorded loop, compiled, with their numbers and the disturbance.
+
+    On arrays every value has an interval beside its form (:mod:`.affine.compiled.intervals`), wherever that can make a
+    difference: where feedback keeps hold of a loop forms are tighter throughout, and intervals cost time. So they are
+    carried along only in cells where they make something tighter, and steps without them are checked, many at once,
+    which takes little longer than one (:meth:`check`): if an interval is tighter at any step, all steps are to be taken
+    again. No tube is ever wider than by intervals alone.
+
+    On tensors, where a tube is trained, intervals serve only cells in which an operation's domain was left: an end that
+    an interval decides has no gradient with respect to what is trained.
 
     Args:
         loop: what steps.
         disturbance: W, ``(d,)``; or one box for each step and cell, ``(K, B, d)``.
         cells: shape of the batch of cells; the loop's own batch broadcasts to it.
         tensors: whether to compute with tensors.
+        watch: whether control and deviation are to be bounded.
     """
 
-    def __init__(self, loop: RecordedLoop, disturbance: Box, cells: torch.Size, *, tensors: bool) -> None:
+    def __init__(
+        self, loop: RecordedLoop, disturbance: Box, cells: torch.Size, *, tensors: bool, watch: bool = False
+    ) -> None:
         numbers = loop.numbers_in(cells) if len(loop.batch) else loop.numbers[:, None]
-        self._numbers = numbers.flatten(1, -2)
-        self._disturbance, self._tensors = disturbance, tensors
-        self._ready = [_Ready(p, self._numbers, disturbance, tensors=tensors) for p in loop.programs]
-        self._varies = disturbance.lower.dim() > 1
+        numbers = numbers.flatten(1, -2)
+        self.every_cell = np.ones(cells.numel(), dtype=bool)
+        self._watch = watch
+        self._ready = [_Ready(p, numbers, disturbance, tensors=tensors) for p in loop.programs]
 
-    def evaluate(self, k: int, states: Zonotope, hints: Hints | None) -> tuple[Frame, Value, Value | None]:
-        """Step k from a set: its frame, the next state, and control and deviation if the loop says them."""
+    def evaluate(
+        self, k: int, states: Zonotope, box: Sides, hints: Hints | None = None, carrying: np.ndarray | None = None
+    ) -> Done:
+        """Step k from a set.
+
+        Args:
+            k: which step.
+            states: the set.
+            box: bounds of the states besides, ``(B, n)`` each.
+            hints: what is known of the operations.
+            carrying: cells ``(B,)`` in which intervals are carried along; None: only where an operation's domain is
+                left otherwise.
+        """
         ready = self._of(k)
-        frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=hints)
-        after, watched = ready.evaluate(k, frame)
-        if not math.isfinite(after.both.sum().item()):
+
+        def taken(cells: Any) -> tuple[Frame, Value, Value | None, Carried | None]:
+            carried = ready.carried([k], *box) if cells is not None and bool(cells.any()) else None
+            frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=hints)
+            return frame, *ready.evaluate(k, frame, carried, cells), carried
+
+        frame, after, form, carried = taken(carrying)
+        if carrying is None and not math.isfinite(after.both.sum().item()):
             m = functions_of(after.both)
             lost = m.isfinite(states.reach).all(-1) & ~m.isfinite(after.both).all(0).all(-1)
-            if bool(lost.any()):  # an operation's domain was left: intervals may know better
-                known = sharper(self._operands(k, states), hints, where=torch.as_tensor(lost))
-                frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=known)
-                after, watched = ready.evaluate(k, frame)
-        return frame, after, watched
+            if bool(lost.any()):  # intervals may know better
+                frame, after, form, _ = taken(lost)
+        following = frame.advanced(after)
+        form_of_next = low, high = following.low, following.high
+        watched = None if form is None or not self._watch else frame.bounds(form)
+        if carrying is not None and carried is not None:
+            known = _of_cells(carried.next(), carrying)
+            low, high = np.fmax(low, known[0]), np.fmin(high, known[1])
+            if watched is not None:
+                known = _of_cells(carried.watched(), carrying)
+                watched = np.fmax(watched[0], known[0]), np.fmin(watched[1], known[1])
+        operands = [] if carrying is None or carrying.all() else ready.operand_bounds(frame)
+        trace = Trace(box, operands, form_of_next)
+        return Done(frame, after, following, low, high, watched, form, trace)
 
-    def _operands(self, k: int, states: Zonotope) -> list[Hint]:
-        """What intervals know of step k's operations."""
-        low, high = (torch.as_tensor(side).detach() for side in (states.low, states.high))
-        numbers = self._numbers[k].detach()
-        disturbance = [s[k] if self._varies else s for s in (self._disturbance.lower, self._disturbance.upper)]
-        given = ((low, high), disturbance, (numbers, numbers))
-        with torch.no_grad():
-            return operands(self._of(k).program, *(IntervalForm(*sides) for sides in given))
+    def check(self, first: int, steps: Sequence[Trace], carrying: np.ndarray | None) -> Missed:
+        """What intervals know of steps, the first of which is step ``first``, in cells where they were not carried."""
+        none = np.zeros_like(self.every_cell)
+        if carrying is None or carrying.all():
+            return Missed(none, [])
+        cells, sharper = none, []
+        every = list(enumerate(steps, start=first))
+        for group in [every] if len(self._ready) == 1 else [[one] for one in every]:
+            numbers, traces = zip(*group, strict=True)
+            ready = self._of(numbers[0])
+            carried = ready.carried(numbers, *_together([t.before for t in traces]))
+            tighter = ready.followed(carried, [t.operands for t in traces])
+            tighter = tighter | _tighter(_together([t.after for t in traces]), carried.next())
+            cells = cells | tighter.reshape(len(traces), -1).any(0)
+            if self._watch and ready.watches:
+                sides = (np.split(side, len(traces)) for side in carried.watched())
+                sharper += list(zip(*sides, strict=True))
+        return Missed(cells & ~carrying, sharper)
 
     def _of(self, k: int) -> _Ready:
         return self._ready[k if len(self._ready) > 1 else 0]
@@ -90,8 +198,8 @@ class _Ready:
     """One program, compiled, with the numbers of all steps."""
 
     def __init__(self, program: Program, numbers: Tensor, disturbance: Box, *, tensors: bool) -> None:
-        self.program = program
         step = compiled(program)
+        self._intervals = functools.cache(lambda: Intervals(step, numbers, disturbance))
         self.inputs = step.states + step.disturbances
         radius = disturbance.radius
         ones = radius.new_ones(*radius.shape[:-1], sum(node.size for node in step.nodes))
@@ -109,10 +217,27 @@ class _Ready:
         """Radii of the variables of step k but the states, see :class:`.Frame`."""
         return self._own_radius if self._own_radius.ndim == 1 else self._own_radius[k][:, None]
 
-    def evaluate(self, k: int, frame: Frame) -> tuple[Value, Value | None]:
+    def carried(self, steps: Sequence[int], low: Array, high: Array) -> Carried:
+        """Intervals of steps from bounds of the states, ``(steps * B, n)``."""
+        sides = (side if isinstance(side, np.ndarray) else side.detach().numpy() for side in (low, high))
+        return Carried(self._intervals(), steps, *sides)
+
+    def evaluate(self, k: int, frame: Frame, carried: Carried | None, cells: Any) -> tuple[Value, Value | None]:
+        """The next state, and control and deviation if the loop says them.
+
+        Args:
+            k: which step.
+            frame: the set before it; what is done is noted there.
+            carried: intervals to be carried along.
+            cells: where they are used.
+        """
         results: list[Value] = []
         known: list[Bounded] = []  # of a function whose turn is next
         for i, (node, fold) in enumerate(self._nodes):
+            operands = None
+            if carried is not None:
+                operands = carried.operand(i)
+                frame.within = _of_cells(operands, cells)
             if known:
                 results.append(enclosed(node, frame, known.pop()))
             elif i in self._pairs:
@@ -122,8 +247,62 @@ class _Ready:
                 known.append(second)
             else:
                 results.append(EVALUATE[node.rule](node, frame, fold(k, frame, results)))
+            if carried is not None and operands is not None:
+                carried.know(i, operands, _operand_bounds(node, frame.relaxed[-1]))
         watched = None if self._watched is None else self._watched(k, frame, results)
         return self._next(k, frame, results), watched
+
+    @property
+    def watches(self) -> bool:
+        """Whether the loop says its controls or deviations."""
+        return self._watched is not None
+
+    def operand_bounds(self, frame: Frame) -> list[Sides | None]:
+        """Bounds of the operands of all operations by their forms, as far as they are known."""
+        return [_operand_bounds(node, r) for (node, _), r in zip(self._nodes, frame.relaxed, strict=True)]
+
+    def followed(self, carried: Carried, operands: Sequence[Sequence[Sides | None]]) -> np.ndarray:
+        """Let intervals follow steps that were taken; where they are noticeably tighter, ``(steps * B,)``."""
+        tighter = np.zeros(1, dtype=bool)
+        for i, (node, _) in enumerate(self._nodes):
+            known = carried.operand(i)
+            every = [of_step[i] for of_step in operands]
+            form = None
+            if every[0] is not None:
+                form = _together(every)
+                low, high = (side[:, : form[0].shape[-1]] for side in known)
+                tighter = tighter | noticeably(node, *form, np.fmax(form[0], low), np.fmin(form[1], high))
+            carried.know(i, known, form)
+        return tighter
+
+
+def _operand_bounds(node: Node, relaxed: Relaxed) -> Sides | None:
+    """Bounds of the operands of an operation by its form, of the first ones at least; None if they are not known."""
+    if node.rule == "product" and relaxed.factors is not None:
+        return relaxed.factors.bounds
+    return None if node.rule in ("angle", "quotient") else (relaxed.lower, relaxed.upper)
+
+
+def _together(sides: Sequence[Any]) -> Sides:
+    """Bounds of several steps, one after the other."""
+    low, high = (np.concatenate(side) for side in zip(*sides, strict=True))
+    return low, high
+
+
+def _tighter(form: Sides, interval: Sides) -> np.ndarray:
+    """In which cells the interval has an end inside of the form's bounds, but for rounding, ``(B,)``."""
+    doubt = NOTHING * (abs(form[0]) + abs(form[1]))
+    return ~((interval[0] <= form[0] + doubt) & (interval[1] >= form[1] - doubt)).all(-1)
+
+
+def _of_cells(sides: tuple[np.ndarray, np.ndarray], cells: Any) -> Sides:
+    """Bounds that say something of some cells only, as arrays or tensors, as what the cells are."""
+    if isinstance(cells, np.ndarray):
+        if cells.all():
+            return sides
+        return np.where(cells[:, None], sides[0], -math.inf), np.where(cells[:, None], sides[1], math.inf)
+    low, high = map(torch.from_numpy, sides)
+    return torch.where(cells[:, None], low, -math.inf), torch.where(cells[:, None], high, math.inf)
 
 
 def _placed(tensor: Tensor, tensors: bool) -> Array:
