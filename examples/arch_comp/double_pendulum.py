@@ -1,4 +1,4 @@
-"""A double pendulum under two controllers; the claims about both are false."""
+"""A double pendulum under two controllers; the claim about the more robust one is false, the other is true."""
 
 import torch
 

@@ -90,7 +90,7 @@ class Stage:
         self, found: Mapping[str, Any], wanted: Mapping[str, Any], *, without: Sequence[str] = ()
     ) -> tuple[str, Any, Any] | None:
         """The first dotted key that its output depends on and that differs in two configs, with both values."""
-        before, now = (self.settings(config, without=without) for config in (_with_later_keys(found), wanted))
+        before, now = (self.settings(_with_later_keys(config), without=without) for config in (found, wanted))
         return next((_difference(key, before[key], now[key]) for key in now if before[key] != now[key]), None)
 
     @property
@@ -287,11 +287,11 @@ _LATER: Mapping[str, Any] = {
     "proof.substeps": "auto",
     "proof.order": "auto",
 }
-"""Keys that came after files had been written without them, and what these files were made with."""
+"""Keys that came after files had been written without them, and what it means not to say them."""
 
 
 def _with_later_keys(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The config of a file, with what it does not say because nothing else was possible."""
+    """A config with what it does not say."""
     found = dict(config)
     for dotted, value in _LATER.items():
         *sections, key = dotted.split(".")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 
 from sagemp_cli.config.composition import compose
@@ -31,3 +33,16 @@ def test_finished_pieces_may_depend_on_less_than_the_output():
     gen_data = stage_named("gen-data")
     assert "count" in gen_data.settings(compose())["expert"]
     assert "count" not in gen_data.settings(compose(), without=("expert.count",))["expert"]
+
+
+@pytest.mark.parametrize("experiment", ["unicycle_node", "unicycle_node_learned"])
+def test_keys_that_came_later_do_not_make_older_files_stale(experiment):
+    now = compose([f"experiment={experiment}"])
+    older = copy.deepcopy(now)
+    older["dynamics"].pop("time", None)
+    older["dynamics"].get("model", {}).pop("time", None)
+    older["proof"] = {k: v for k, v in older["proof"].items() if k not in ("substeps", "order")}
+    stage = stage_named("verify")
+    assert stage.difference(older, now) is None and stage.difference(now, older) is None
+    asked = compose([f"experiment={experiment}", "proof.substeps=2"])
+    assert stage.difference(older, asked) == ("proof.substeps", "auto", 2)
