@@ -84,13 +84,15 @@ def test_a_violation_between_two_samples_alone_is_not_called_proved():
 
 def test_more_cells_are_taken_where_one_does_not_do():
     wide = seen(start=box([-0.6, -0.6], [0.6, 0.6]))
+    parts = {"substeps": 1, "order": 2}  # finer ones would do as well
     anything = Inside({"angle": (-99.0, 99.0)})
     one, many = (
-        float(verdict(anything, observed=wide, counts=c, restarts=0).tube.upper[-1, 0]) for c in ([1, 1], [4, 4])
+        float(verdict(anything, observed=wide, counts=c, restarts=0, **parts).tube.upper[-1, 0])
+        for c in ([1, 1], [4, 4])
     )
     tight = Inside({"angle": (-0.5 * (one + many), 0.5 * (one + many))}, when="end")
-    assert verdict(tight, observed=wide, counts=[1, 1], restarts=0).answer is Answer.UNKNOWN
-    proof = verdict(tight, observed=wide)
+    assert verdict(tight, observed=wide, counts=[1, 1], restarts=0, **parts).answer is Answer.UNKNOWN
+    proof = verdict(tight, observed=wide, **parts)
     assert proof.answer is Answer.VERIFIED and proof.cells > 1
     lower = torch.cat([p.cells.lower for p in proof.pieces]).amin(0)
     upper = torch.cat([p.cells.upper for p in proof.pieces]).amax(0)
