@@ -108,7 +108,7 @@ def _power(a: tuple[arb, arb], exponent: int) -> Range:
     ends = a[0] ** exponent, a[1] ** exponent
     if exponent % 2 or a[0] >= 0:
         return ends
-    return ends[::-1] if a[1] <= 0 else (_ZERO, ends[0].max(ends[1]))
+    return (ends[1], ends[0]) if a[1] <= 0 else (_ZERO, ends[0].max(ends[1]))
 
 
 def _size(a: tuple[arb, arb]) -> Range:

@@ -129,15 +129,17 @@ class Step:
         within = self._beside.operands(slot)
         before = [list(side) for side in within]
         if kind == "mul":
-            rows = self._product(*repeated(operands), within)
+            rows = self._product(*_pair(repeated(operands)), within)
         elif kind == "div":
-            rows = self._quotient(*operands, within, numbers=not given[0])
+            rows = self._quotient(operands[0], operands[1], within, numbers=not given[0])
         elif kind in ("maximum", "minimum"):
             rows = (
-                self._extreme(kind, *operands, within) if all(given) else self._limited(kind, operands, given, within)
+                self._extreme(kind, operands[0], operands[1], within)
+                if all(given)
+                else self._limited(kind, operands, given, within)
             )
         elif kind == "atan2":
-            rows = self._angle(*repeated(operands), within)
+            rows = self._angle(*_pair(repeated(operands)), within)
         else:
             functions = functions_of(instruction, len(operands[0]))
             rows = self._relaxed(kind, operands[0], [f.excess for f in functions], within[0])
@@ -242,7 +244,8 @@ class Step:
         for i, entry in enumerate(entries):
             turned = Turned(cosines[i], sines[i], v[i], u[i], across[i][0], along[i][0], plus[i], minus[i])
             slope = ball(entry.slope)
-            found = angle_excess(slope, *boxes[i], turned)
+            of_y, of_x = boxes[i]
+            found = angle_excess(slope, of_y, of_x, turned)
             out.append(self._put("atan2", times(across[i], slope), found, entry))
         return out
 
@@ -300,3 +303,9 @@ def _ratio(a: arb, b: arb) -> arb:
     """A number near the root of a quotient; 1 where there is none."""
     root = (a / b).sqrt().mid()
     return root if root.is_finite() and root > 0 else arb(1)
+
+
+def _pair(operands: Sequence[Rows]) -> tuple[Rows, Rows]:
+    """Two operands."""
+    first, second = operands
+    return first, second

@@ -179,8 +179,8 @@ class Affine(Propagator):
                 for f, s in ((start.lower, course.lows), (start.upper, course.highs))
             )
         )
-        asked = [_in_batch(side, batch) for side in zip(*course.controls, strict=True)] or (None, None)
-        return AffineRun(tube, course.bands, course.masks, course.kept, *asked, course.boxed.notes(), course.states)
+        low, high = [_in_batch(side, batch) for side in zip(*course.controls, strict=True)] or (None, None)
+        return AffineRun(tube, course.bands, course.masks, course.kept, low, high, course.boxed.notes(), course.states)
 
 
 @dataclass

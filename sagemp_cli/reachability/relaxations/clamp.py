@@ -8,6 +8,8 @@ kinks; higher than either, it rises.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -41,13 +43,11 @@ def lines(lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float 
     return _lines.settled(Lines(below, least, above, most + 0.0 * (lower + upper)))
 
 
-def value_range(
-    lower: Tensor, upper: Tensor, minimum: float | Tensor, maximum: float | Tensor
-) -> tuple[Tensor, Tensor]:
+def value_range(lower: Any, upper: Any, minimum: float | Tensor, maximum: float | Tensor) -> tuple[Any, Any]:
     """Bounds on ``[lower, upper]``, exact; of an unknown argument the limits; of tensors or of arrays."""
     m = functions_of(lower)
     if m is not torch:
-        low, high = (limit if isinstance(limit, float) else limit.numpy() for limit in (minimum, maximum))
+        low, high = (limit.numpy() if isinstance(limit, Tensor) else limit for limit in (minimum, maximum))
         unknown = np.isnan(lower) | np.isnan(upper)
         lower, upper = np.where(unknown, -np.inf, lower), np.where(unknown, np.inf, upper)
         return np.minimum(np.maximum(lower, low), high), np.minimum(np.maximum(upper, low), high)

@@ -56,7 +56,7 @@ class _Numpy:
         return x if max is None else np.minimum(x, max)
 
     @staticmethod
-    def nan_to_num(x: np.ndarray, **values: float) -> np.ndarray:
+    def nan_to_num(x: np.ndarray, **values: Any) -> np.ndarray:
         return x if math.isfinite(x.sum()) else np.nan_to_num(x, **values)
 
     @staticmethod

@@ -219,7 +219,7 @@ def _joined(parts: Sequence[Combination]) -> Combination:
     columns = max(part.matrix.shape[-1] for part in parts)
     rows = [part.padded(columns) for part in parts]
     copies = torch.cat([torch.zeros(len(r[0]), 1, dtype=torch.bool) if r.copies is None else r.copies for r in rows])
-    matrix, sizes = (torch.cat([r[i] for r in rows]) for i in range(2))
+    matrix, sizes = torch.cat([r.matrix for r in rows]), torch.cat([r.sizes for r in rows])
     return Combination(matrix, sizes, max(r.error for r in rows), copies)
 
 
