@@ -24,7 +24,7 @@ from torch import Tensor
 from sagemp_cli.reachability.continuous.expansion import Expansion
 from sagemp_cli.reachability.interval.form import IntervalForm
 from sagemp_cli.reachability.interval.form import evaluate as any_evaluate
-from sagemp_cli.reachability.program.program import Instruction
+from sagemp_cli.reachability.program.program import Instruction, Program
 from sagemp_cli.sets import Box, round_down, round_up
 from sagemp_cli.sets.rounding import TINY
 
@@ -41,7 +41,7 @@ class Enclosure:
     Attributes:
         lower, upper: a box that the flow does not leave, ``(N, n)``.
         remainder_lower, remainder_upper: what the polynomial leaves out, ``(N, n)``.
-        curve: bound of ``h^2 / 2 |y''|`` of the solutions y under constant w, ``(N, n)``.
+        curve: bound of ``h^2 / 2 |z''|`` of the solutions z under constant w, ``(N, n)``.
         drift: e, ``(N, n)``.
     """
 
@@ -52,11 +52,6 @@ class Enclosure:
     curve: Tensor
     drift: Tensor
 
-    @property
-    def found(self) -> Tensor:
-        """Whether there is one, ``(N,)``."""
-        return torch.isfinite(self.remainder_lower).all(-1) & torch.isfinite(self.remainder_upper).all(-1)
-
 
 @torch.no_grad()
 def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> Enclosure:
@@ -65,7 +60,7 @@ def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | 
     inside = _flowed(programs, state, stay, control, w)  # as an image it is no larger than what it was found in
     n, h, p = state.lower.shape[-1], programs.length, programs.division.order
     given = IntervalForm(w.lower, w.upper)
-    (found,) = _outputs(programs.coefficients, inside, given, control)
+    found = _watched(programs.coefficients, inside, given, control)
     second, last = (IntervalForm(found.lower[:, i : i + n], found.upper[:, i : i + n]) for i in (0, (p > 1) * n))
     slopes = _slopes(programs, inside, control)
     drift = _drift(slopes, w.radius, h)
@@ -99,17 +94,17 @@ def _times(a: IntervalForm, least: float, most: float) -> tuple[Tensor, Tensor]:
     return torch.nan_to_num(round_down(low), nan=-torch.inf), torch.nan_to_num(round_up(high), nan=torch.inf)
 
 
-def _outputs(program, state: IntervalForm, w: IntervalForm, numbers: IntervalForm | None) -> tuple[IntervalForm]:
+def _watched(program: Program, state: IntervalForm, w: IntervalForm, numbers: IntervalForm | None) -> IntervalForm:
     """Of a program, the output ``control``, for all N parts."""
     found = program.run(state, w, numbers, evaluate=evaluate).control
     batch = torch.broadcast_shapes(found.lower.shape[:-1], state.lower.shape[:-1])
-    return (IntervalForm(*(side.expand(*batch, -1) for side in found.bounds)),)
+    return IntervalForm(*(side.expand(*batch, -1) for side in found.bounds))
 
 
 def _flowed(
     programs: Expansion, state: IntervalForm, stay: IntervalForm, control: IntervalForm | None, w: Box
 ) -> IntervalForm:
-    """``B + [0, h] (f(X, U) + W)``, within X where that is smaller."""
+    """``B + [0, h] (f(X, U) + W)``."""
     rate = programs.rate.run(stay, IntervalForm(w.lower, w.upper), control, evaluate=evaluate).next
     low, high = round_down(rate.lower + w.lower), round_up(rate.upper + w.upper)
     low, high = low.clamp(max=0.0) * programs.length, high.clamp(min=0.0) * programs.length
@@ -150,7 +145,7 @@ def _slopes(programs: Expansion, inside: IntervalForm, control: IntervalForm | N
     if control is not None:
         given = [torch.cat([side.expand(n, *side.shape), e], -1) for side, e in zip(control.bounds, given, strict=True)]
     nothing = torch.zeros(n, dtype=torch.float64)
-    (slope,) = _outputs(programs.tangent, IntervalForm(*parts), IntervalForm(nothing, nothing), IntervalForm(*given))
+    slope = _watched(programs.tangent, IntervalForm(*parts), IntervalForm(nothing, nothing), IntervalForm(*given))
     return IntervalForm(*(side.permute(1, 2, 0) for side in slope.bounds))
 
 
