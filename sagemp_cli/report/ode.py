@@ -21,7 +21,7 @@ from sagemp_cli.report.canvas import (
 from sagemp_cli.verification.continuous.proof import OdeProof
 
 _SAYS = {
-    "VERIFIED": "Certified",
+    "VERIFIED": "Certified: every solution does what is asked",
     "FALSIFIED": "Falsified: a solution breaks the claim, proved by an enclosure of it",
     "UNKNOWN": "Unknown: the tube does not prove it, and no counterexample was found",
 }
@@ -43,7 +43,7 @@ def draw_ode(
         limits: bounds that are asked for of some of the states.
     """
     n, answer = len(state_names), str(proof.answer)
-    columns = min(3, n)
+    columns = next(c for c in (3, 2, 1) if n % c == 0) if n < 5 else 3
     rows = -(-n // columns)
     figure = blank_figure(4.2 * columns, 2.4 * rows + 0.9)
     cells = f"{proof.cells} cell{'s' * (proof.cells != 1)}"

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
-
-INPUT_KINDS = ("state", "disturbance", "numbers")
+from sagemp_cli.reachability.program.kinds import INPUTS
+from sagemp_cli.reachability.program.program import Instruction, Outputs, Program, program_of
 
 
 class Writer:
@@ -82,32 +81,18 @@ class Writer:
         """Another program's outputs, with its inputs replaced by values."""
         values: list[int] = []
         for i in program.instructions:
-            if i.kind in INPUT_KINDS:
+            if i.kind in INPUTS:
                 values.append(inputs.get(i.kind, self.disturbance))
+            elif i.kind == "constant":
+                values.append(self.constant(i.constants[0]))
             else:
-                values.append(self.embedded_instruction(i, [values[o] for o in i.operands]))
+                values.append(self.made(i, [values[o] for o in i.operands]))
         return program.outputs.of(values)
-
-    def embedded_instruction(self, i: Instruction, operands: Sequence[int]) -> int:
-        """An instruction of another program, on values of this one."""
-        return self.constant(i.constants[0]) if i.kind == "constant" else self.made(i, operands)
 
     def finished(self, **outputs: int | None) -> Program:
         """The program, without what no output needs."""
         inputs = [s for s in (self.state, self.disturbance, self.numbers) if s is not None]
-        needed, pending = set(inputs), [slot for slot in outputs.values() if slot is not None]
-        while pending:
-            slot = pending.pop()
-            if slot not in needed:
-                needed.add(slot)
-                pending.extend(self._instructions[slot].operands)
-        order = sorted(needed)
-        number = {slot: i for i, slot in enumerate(order)}
-        instructions = tuple(
-            Instruction(i.kind, i.size, tuple(number[o] for o in i.operands), i.constants, i.entries)
-            for i in (self._instructions[slot] for slot in order)
-        )
-        return Program(instructions, Outputs(**{n: None if s is None else number[s] for n, s in outputs.items()}))
+        return program_of(self._instructions, inputs, outputs)
 
     def _varying(self, slot: int) -> int:
         """A constant as a function of the state that does not look at it."""

@@ -7,7 +7,7 @@ carried by a certificate, and evaluated by the checker, each with its own meanin
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -164,6 +164,33 @@ class Program:
                 for a, b in zip(self.instructions, other.instructions, strict=True)
             )
         )
+
+
+def program_of(
+    instructions: Sequence[Instruction], inputs: Iterable[int], outputs: Mapping[str, int | None]
+) -> Program:
+    """The program of instructions that may have come in any order that is one of evaluation: without what no output
+    needs, and with the inputs first.
+
+    Args:
+        instructions: instruction i makes slot i.
+        inputs: slots of the inputs, which stay even where nothing reads them.
+        outputs: slots by name; None where there is none.
+    """
+    first = sorted(inputs)
+    needed, pending = set(first), [slot for slot in outputs.values() if slot is not None]
+    while pending:
+        slot = pending.pop()
+        if slot not in needed:
+            needed.add(slot)
+            pending.extend(instructions[slot].operands)
+    order = [*first, *sorted(needed.difference(first))]
+    number = {slot: i for i, slot in enumerate(order)}
+    kept = (instructions[slot] for slot in order)
+    return Program(
+        tuple(replace(i, operands=tuple(number[o] for o in i.operands)) for i in kept),
+        Outputs(**{name: None if slot is None else number[slot] for name, slot in outputs.items()}),
+    )
 
 
 def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str | None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sagemp_cli.errors import SagempError, UsageError
 from sagemp_cli.reachability.program.kinds import INPUTS
-from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
+from sagemp_cli.reachability.program.program import Instruction, Program, program_of
 
 
 @dataclass(frozen=True)
@@ -120,21 +120,7 @@ class Recorder:
             operand = None if ids is None else self.operand(ids, full=True)
             slots[name] = self._constant_slot(operand) if isinstance(operand, Tensor) else operand and operand.index
         inputs = {int(self._owner[ids[0]]) for ids in (self.state, self.disturbance, self.numbers) if len(ids)}
-        needed, pending = set(inputs), [slot for slot in slots.values() if slot is not None]
-        while pending:
-            slot = pending.pop()
-            if slot not in needed:
-                needed.add(slot)
-                pending.extend(self._instructions[slot].operands)
-        order = [*sorted(inputs), *sorted(needed - inputs)]  # the constant 0 was there before the inputs
-        number = {slot: i for i, slot in enumerate(order)}
-        kept = [self._instructions[slot] for slot in order]
-        return Program(
-            tuple(
-                Instruction(i.kind, i.size, tuple(number[o] for o in i.operands), i.constants, i.entries) for i in kept
-            ),
-            Outputs(**{name: None if slot is None else number[slot] for name, slot in slots.items()}),
-        )
+        return program_of(self._instructions, inputs, slots)
 
     # -- bookkeeping ---------------------------------------------------------------------------------------------------
 
