@@ -1,4 +1,7 @@
-"""Reading a certificate or a library: the file is untrusted input, and everything in it is checked."""
+"""Reading a certificate or a library: the file is untrusted input, and everything in it is checked.
+
+One file for all of it, longer than others: what is believed of a file is to be read in one place.
+"""
 
 from __future__ import annotations
 

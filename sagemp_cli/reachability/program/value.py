@@ -7,6 +7,8 @@ program. All else is an error that names the operation; above all, nothing may a
 set has none.
 
 Constants are taken as the exact numbers they are: float32 weights are not rounded, nor is anything else.
+
+Longer than other files: one class has to answer all that a tensor is asked.
 """
 
 from __future__ import annotations

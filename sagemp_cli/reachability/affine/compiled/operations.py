@@ -11,7 +11,7 @@ is at most ``error`` times it (:mod:`sagemp_cli.sets.rounding`). A nonlinear ope
 the rounding of its input into its own radius and starts again.
 
 Everything is written once, for numpy's arrays, whose operations on a few numbers cost a fifth of torch's, and for
-tensors, through which a tube is differentiated.
+tensors, through which a tube is differentiated. It is one long file because all rules share the account of rounding.
 """
 
 from __future__ import annotations
