@@ -14,7 +14,6 @@ Everything is for all parts of all periods and cells at once, and rounded outwar
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,9 +21,8 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.continuous.expansion import Expansion
-from sagemp_cli.reachability.interval.form import IntervalForm
-from sagemp_cli.reachability.interval.form import evaluate as any_evaluate
-from sagemp_cli.reachability.program.program import Instruction, Program
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
+from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
 from sagemp_cli.sets import Box, round_down, round_up
 from sagemp_cli.sets.rounding import TINY
 
@@ -71,16 +69,24 @@ def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | 
     return Enclosure(stay.lower, stay.upper, round_down(low - end), round_up(high + end), _number(curve), drift)
 
 
-def evaluate(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
-    """What an instruction makes of intervals over which it is smooth; unbounded where an angle may jump, although its
-    values are bounded there: it has no derivative.
+def run_smoothly(
+    program: Program, state: IntervalForm, w: IntervalForm, numbers: IntervalForm | None
+) -> tuple[Outputs, Tensor]:
+    """What a program gives over boxes ``(..., n)``, and over which of them it is smooth, ``(...)``.
+
+    An angle may jump where its values are bounded all the same, and whatever is made of it then may be bounded too:
+    so it is the operation that tells, and not the result.
     """
-    found = any_evaluate(i, operands)
-    if i.kind != "atan2":
-        return found
-    y, x = operands
-    smooth = (x.lower > 0) | (y.lower > 0) | (y.upper < 0)
-    return IntervalForm(torch.where(smooth, found.lower, -math.inf), torch.where(smooth, found.upper, math.inf))
+    smooth = torch.ones(state.lower.shape[:-1], dtype=torch.bool)
+
+    def noted(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
+        nonlocal smooth
+        if i.kind == "atan2":
+            y, x = operands
+            smooth = smooth & ((x.lower > 0) | (y.lower > 0) | (y.upper < 0)).all(-1)
+        return evaluate(i, operands)
+
+    return program.run(state, w, numbers, evaluate=noted), smooth
 
 
 def _number(bound: Tensor) -> Tensor:
@@ -104,9 +110,11 @@ def _watched(program: Program, state: IntervalForm, w: IntervalForm, numbers: In
 def _flowed(
     programs: Expansion, state: IntervalForm, stay: IntervalForm, control: IntervalForm | None, w: Box
 ) -> IntervalForm:
-    """``B + [0, h] (f(X, U) + W)``."""
-    rate = programs.rate.run(stay, IntervalForm(w.lower, w.upper), control, evaluate=evaluate).next
-    low, high = round_down(rate.lower + w.lower), round_up(rate.upper + w.upper)
+    """``B + [0, h] (f(X, U) + W)``; unbounded where f may jump."""
+    found, smooth = run_smoothly(programs.rate, stay, IntervalForm(w.lower, w.upper), control)
+    rate, smooth = found.next, smooth[..., None]
+    low = torch.where(smooth, round_down(rate.lower + w.lower), -torch.inf)
+    high = torch.where(smooth, round_up(rate.upper + w.upper), torch.inf)
     low, high = low.clamp(max=0.0) * programs.length, high.clamp(min=0.0) * programs.length
     return IntervalForm(round_down(state.lower + round_down(low)), round_up(state.upper + round_up(high)))
 

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.continuous.enclosure import run_smoothly
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.continuous.series import Series, state_coefficients
 from sagemp_cli.reachability.continuous.writing import Writer
@@ -127,6 +128,8 @@ def along(
     ends[0], ends[1] = torch.nan_to_num(ends[0], nan=-torch.inf), torch.nan_to_num(ends[1], nan=torch.inf)
     instants, _ = _bounds(g.value, IntervalForm(*ends), None, None)
     stay = IntervalForm(flow.lower.flatten(1, 2), flow.upper.flatten(1, 2))
+    nothing = IntervalForm(*(torch.zeros(1, dtype=torch.float64) for _ in range(2)))
+    _, smooth = run_smoothly(g.value, stay, nothing, None)
     over, _ = _bounds(g.value, stay, None, None)
     if g.change is None:
         return instants, over
@@ -140,7 +143,8 @@ def along(
         bend = torch.maximum(lower[..., g.size :].abs(), upper[..., g.size :].abs()) * (h * h / 4 * (1 + 1e-12))
         chord = round_down(torch.minimum(a, b) - round_up(bend))
         least = torch.maximum(least, torch.nan_to_num(chord, nan=-torch.inf))
-    return instants, torch.maximum(over, least)
+    # Where g may jump, as an angle does, it is no integral of its rate of change.
+    return instants, torch.where(smooth[..., None], torch.maximum(over, least), over)
 
 
 def _between(a: Tensor, b: Tensor, slow: Tensor, fast: Tensor, h: float) -> Tensor:

@@ -81,3 +81,30 @@ def test_between_the_instants_a_smooth_function_is_bounded_by_the_chord_and_its_
     g = observable(lambda x: x[..., :1] - x[..., 1:], loop, start.center[0], "difference")
     _, over = along(g, loop, reach.flow, reach.tube, (reach.control_lower, reach.control_upper), w)
     assert float(over.amin()) > -1e-6  # the difference of the boxes is -0.2
+
+
+@pytest.mark.parametrize("speed", [1.0, -1.0])
+def test_an_angle_that_jumps_within_a_part_is_not_bounded_by_its_rate_of_change(speed):
+    """Half a turn within a period, across the cut from pi to -pi: no line from either end knows of the jump."""
+
+    class Turning(Loop):
+        horizon, period = 2, 0.4
+
+        def control_given(self, numbers, x):
+            return 0.0 * x[..., :1]
+
+        def rate(self, x, u):
+            return torch.cat([-speed * x[..., 1:], speed * x[..., :1]], -1) + 0.0 * u
+
+    angle = torch.tensor(torch.pi - 0.2 * speed).double() * (1.0 if speed > 0 else -1.0)
+    x = torch.stack([torch.cos(angle), torch.sin(angle)])
+    start, still = Box(x[None] - 1e-3, x[None] + 1e-3), Box(torch.zeros(2).double(), torch.zeros(2).double())
+    loop = sampled(Turning(), start)
+    reach = reach_continuously(Affine(), loop, start, still, substeps=1, order=4)
+    for sign, after in ((1.0, torch.clone), (-1.0, torch.clone), (1.0, torch.tanh), (-1.0, torch.tanh)):
+        g = observable(lambda x, s=sign, f=after: s * f(torch.atan2(x[..., 1:], x[..., :1]) * 1), loop, x, "angle")
+        _, over = along(g, loop, reach.flow, reach.tube, (reach.control_lower, reach.control_upper), still)
+        times = torch.linspace(0, Turning.period, 400).double()
+        turned = angle + speed * times
+        least = (sign * after(torch.atan2(torch.sin(turned), torch.cos(turned)))).amin()
+        assert float(over[0, 0, 0]) <= float(least) + 1e-9
