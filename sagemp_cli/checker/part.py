@@ -114,7 +114,9 @@ class PartProver:
         return [[column[i] for column in columns] for i in range(n)]
 
     def _drift_at_the_end(self, drift: Sequence[arb], slopes: Sequence[Column], h: arb) -> list[arb]:
-        """g, if e is what it is said to be."""
+        """g, if e is what it is said to be: a bound of a size, for below 0 the inequality may hold of anything."""
+        if not all(e >= 0 for e in drift):
+            raise Unproved("a drift is below 0, or no number")
         swung = [3 * h * h / 4 * r for r in self._radius]
         end = []
         for i, row in enumerate(slopes):

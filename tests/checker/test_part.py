@@ -132,3 +132,18 @@ def test_the_width_of_the_slopes_counts_at_the_end_of_a_part():
             less = dataclasses.replace(claim, **{name: np.full((1, 1, 1), v) for name, v in change.items()})
             with pytest.raises(Unproved, match="the remainder"):
                 prover.prove(less, (0, 0), begin, [])
+
+
+def test_a_drift_below_zero_proves_nothing():
+    """Where f is steep, ``e >= A (3/4 h^2 r_W + h e)`` holds of numbers below 0, which bound nothing."""
+    steep = program(line("constant", constants=[20.0]), line("mul", 0, 3), line("sin", 4), n=1, d=1, g=1, next=5)
+    flow = flow_of(CONTROL, steep, period=PERIOD, substeps=1, order=1)
+    with ctx.workprec(BITS):
+        begin, control = (list(zip(balls(v[:1]), balls(v[1:]), strict=True)) for v in (X0, U))
+        prover = PartProver(flow, W[:1], W[1:])
+        for drift in (-1.0, -1e-300, np.nan):
+            given = {"lower": -9.0, "upper": 9.0, "remainder_lower": 0.0, "remainder_upper": 0.0, "curve": 99.0}
+            sides = {name: np.full((1, 1, 1), value) for name, value in (given | {"drift": drift}).items()}
+            with pytest.raises(Unproved, match="drift|must be finite"):
+                claim = FlowClaim(np.zeros((1, 0, 1)), np.zeros((1, 0, 1)), **sides)
+                prover.prove(claim, (0, 0), begin, control)
