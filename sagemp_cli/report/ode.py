@@ -48,7 +48,8 @@ def draw_ode(
     figure = blank_figure(4.2 * columns, 2.4 * rows + 0.9)
     cells = f"{proof.cells} cell{'s' * (proof.cells != 1)}"
     about = f"{name}, {proof.loop.horizon} periods of {proof.loop.period:g} s, in continuous time, {cells}"
-    headline(figure, f"{_SAYS[answer]}", about, colour=VERDICT_COLOURS.get(answer, INK))
+    said = _SAYS[answer] if proof.requirements or answer != "VERIFIED" else "Certified: every state stays bounded"
+    headline(figure, said, about, colour=VERDICT_COLOURS.get(answer, INK))
     for i in range(n):
         axes = figure.add_subplot(rows, columns, i + 1)
         unit = f" [{unit_text(state_units[i])}]" if state_units[i] else ""
@@ -58,11 +59,11 @@ def draw_ode(
             if flow is None:
                 continue
             low, high = flow.lower[..., i].flatten(1).numpy(), flow.upper[..., i].flatten(1).numpy()
-            time = np.arange(low.shape[1] + 1) * proof.loop.period / flow.division.substeps
+            time = np.repeat(np.arange(low.shape[1] + 1) * proof.loop.period / flow.division.substeps, 2)[1:-1]
             for bottom, top in zip(low, high, strict=True):
                 known = np.isfinite(bottom) & np.isfinite(top)
-                lower, upper = (np.append(np.where(known, side, np.nan), np.nan) for side in (bottom, top))
-                axes.fill_between(time, lower, upper, step="post", color=MODES[0], alpha=0.35, linewidth=0)
+                lower, upper = (np.repeat(np.where(known, side, np.nan), 2) for side in (bottom, top))
+                axes.fill_between(time, lower, upper, color=MODES[0], alpha=0.35, linewidth=0)
         if proof.violation is not None:
             states = proof.violation.states[:, i].numpy()
             axes.plot(proof.violation.times.numpy(), states, color=DANGER, linewidth=1.2)

@@ -119,6 +119,8 @@ def _box(name: str, given: Any) -> Box | None:
         lower, upper = (torch.tensor([float(pair[i]) for pair in given], dtype=torch.float64) for i in (0, 1))
     except (TypeError, ValueError, IndexError):
         raise UsageError(f"{name} must be a pair of numbers for each state, found {given!r}") from None
+    if not bool((lower <= upper).all()):
+        raise UsageError(f"{name} must be a pair (lower, upper) for each state, found {given!r}")
     return Box(lower, upper)
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from sagemp_cli.errors import UsageError
 from sagemp_cli.stages.prove_ode import plant_of, prove_ode
 
 ROBOT = """
@@ -100,3 +101,13 @@ def test_the_same_from_python():
     low, high = proof.tube.lower[-1, 0], proof.tube.upper[-1, 0]
     assert float(low) <= 0.0625 and float(high) >= 0.06875  # x halves every period
     assert float(low) > 0.0624 and float(high) < 0.0689
+
+
+@pytest.mark.parametrize("start", [((0.3, 0.2), (-0.1, 0.1)), ((0.2,), (-0.1, 0.1)), 3, ((float("nan"), 1.0), (0, 0))])
+def test_a_start_that_is_no_box_is_refused_by_its_name(start):
+    namespace = {}
+    exec(ROBOT, namespace)  # noqa: S102
+    robot = namespace["Robot"]()
+    robot.start = start
+    with pytest.raises(UsageError, match="start must be a pair"):
+        plant_of(robot)
