@@ -27,6 +27,18 @@ def certificate(path, step, **options):
     return path
 
 
+def cool(x):
+    """Linear, and disturbed by nothing: no variable of a step but the states has a say in the next state."""
+    return torch.stack([0.9 * x[..., 0] + 0.1 * x[..., 1], 0.8 * x[..., 1]], dim=-1)
+
+
+def test_a_linear_loop_without_disturbance_is_proved_step_by_step(tmp_path):
+    path = tmp_path / "cool.h5"
+    prove(cool, start=START, disturbance=None, horizon=40, restarts=1, certificate=path)
+    report = check(path)
+    assert report.answer == "VERIFIED", (report.problems, report.findings)
+
+
 @pytest.mark.parametrize("step", [turn, shrink])
 def test_that_a_loop_stays_in_its_tube_is_proved_without_a_scene(step, tmp_path):
     report = check(certificate(tmp_path / "own.h5", step))

@@ -40,6 +40,16 @@ def added(total: Any, part: Any) -> Any:
     return total + torch.nn.functional.pad(part, (0, total.shape[-1] - part.shape[-1]))
 
 
+def widened(coefficients: Any, size: int) -> Any:
+    """Coefficients of so many variables, those that are not there 0."""
+    missing = size - coefficients.shape[-1]
+    if not missing:
+        return coefficients
+    if isinstance(coefficients, Tensor):
+        return torch.nn.functional.pad(coefficients, (0, missing))
+    return np.concatenate([coefficients, np.zeros((*coefficients.shape[:-1], missing))], axis=-1)
+
+
 def repeated(x: Any, count: int, axis: int = 0) -> Any:
     """One entry along an axis as so many."""
     if isinstance(x, Tensor):

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sagemp_cli.reachability.affine.compiled.arrays import added, like, with_fresh
+from sagemp_cli.reachability.affine.compiled.arrays import added, like, widened, with_fresh
 from sagemp_cli.reachability.affine.compiled.folding import Node
 from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints, hint_of
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
@@ -166,9 +166,9 @@ class Frame:
         return after.both[1] * ((after.error + of_generators(self.both.shape[-1])) * SAFETY)
 
     def advanced(self, after: Value) -> Zonotope:
-        """The set after the step whose next state that is."""
+        """The set after the step whose next state that is; every variable of the step has a generator."""
         n = self.both.shape[-1]
-        own = after.coefficients[..., n:]
+        own = widened(after.coefficients[..., n:], self.size - n)
         return self.states.affine_map(
             after.coefficients[..., :n],
             after.both[0],
