@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,16 +10,13 @@ import torch
 
 from sagemp_cli.errors import TubeWarning, UsageError, did_you_mean
 from sagemp_cli.plugins.registry import names, resolve
+from sagemp_cli.reachability.foreseeing import reach_foreseeing
+from sagemp_cli.reachability.halves import Halves
+from sagemp_cli.reachability.narrowing import narrowing_cells
 from sagemp_cli.reachability.observed import check_box, observed
-from sagemp_cli.reachability.propagator import Loop, Propagator
+from sagemp_cli.reachability.propagator import Loop, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import parse_partitions, partition, uncertain_dimensions
-
-AUTO_CELLS = 64
-"""Cells at most with ``partitions="auto"``."""
-
-_GAIN = 0.02
-"""What doubling the cells must narrow the tube by."""
 
 
 def reach(
@@ -59,8 +55,8 @@ def reach(
         horizon: number of steps K; of a loop at most its own, and its own by default.
         propagator: a name that configs know (``affine``, ``best``, ...), or a propagator itself.
         partitions: cells of the start box in all, or counts per uncertain dimension (``"2x2"``, ``[2, 2]``), or
-            ``"auto"``: from one cell on, the count is doubled in the dimension where that narrows the tube most, while
-            it narrows it by 2 % at least, up to :data:`AUTO_CELLS` cells.
+            ``"auto"``: from one cell on, those are halved that the tube's hull hangs on, each in the state where that
+            narrows it most, while it pays, up to 64 cells; see :func:`.narrowing.narrowing_cells`.
         batched: whether the step takes batches; None finds out.
         cells_at_once: most cells in one call of the propagator, which bounds the memory.
         per_cell: whether to give one tube per cell, ``(C, K+1, n)``; row 0 of each is its cell.
@@ -85,14 +81,17 @@ def reach(
 
     notes: dict[str, None] = {}
 
-    def tubes_of(cells: Box) -> Tube:
+    def bounded(cells: Box, propagate: Callable[..., Reach]) -> list[Reach]:
         chunks = zip(cells.lower.split(cells_at_once), cells.upper.split(cells_at_once), strict=True)
         with torch.no_grad():
-            found = [chosen.reach(loop, Box(low, high), disturbance) for low, high in chunks]
+            found = [propagate(chosen, loop, Box(low, high), disturbance) for low, high in chunks]
         notes.update(dict.fromkeys(note for one in found for note in one.notes))
-        return Tube(torch.cat([one.tube.lower for one in found]), torch.cat([one.tube.upper for one in found]))
+        return found
 
-    tubes = _adapted(tubes_of, start) if counts is None else tubes_of(cells_of(start, counts))
+    if counts is None:
+        tubes = narrowing_cells(lambda cells: _with_halves(bounded(cells, reach_foreseeing)), start)
+    else:
+        tubes = _together(bounded(cells_of(start, counts), type(chosen).reach))
     tube = tubes.hull()
     seen.compare(Box(tubes.lower[:, 0], tubes.upper[:, 0]), tube)
     for note in notes:
@@ -114,25 +113,16 @@ def cells_of(start: Box, counts: Sequence[int]) -> Box:
     return partition(start, counts) if counts else Box(start.lower[None], start.upper[None])
 
 
-def _adapted(tubes_of: Callable[[Box], Tube], start: Box) -> Tube:
-    """Tubes of as many cells as pay; see :func:`reach`."""
-    counts = [1] * len(uncertain_dimensions(start))
-    tubes = tubes_of(cells_of(start, counts))
-    while 2 * math.prod(counts) <= AUTO_CELLS:
-        trials = [[c * (1 + (i == d)) for i, c in enumerate(counts)] for d in range(len(counts))]
-        found = [tubes_of(cells_of(start, trial)) for trial in trials]
-        widths = [_log_width(t.hull()) for t in found]
-        best = min(range(len(found)), key=widths.__getitem__)
-        if not widths[best] < _log_width(tubes.hull()) + math.log(1 - _GAIN):
-            break
-        counts, tubes = trials[best], found[best]
-    return tubes
+def _together(found: Sequence[Reach]) -> Tube:
+    """The tubes of all cells."""
+    return Tube(torch.cat([one.tube.lower for one in found]), torch.cat([one.tube.upper for one in found]))
 
 
-def _log_width(tube: Tube) -> float:
-    """Mean over steps after the start and states, of the width's logarithm; huge where it is infinite."""
-    width = torch.nan_to_num(tube.width[1:], nan=1e300, posinf=1e300)
-    return float(width.clamp(1e-300, 1e300).log().mean())
+def _with_halves(found: Sequence[Reach]) -> tuple[Tube, Halves]:
+    """The same, and what halving the cells would do."""
+    halves = Halves.join([one.halves for one in found])
+    assert halves is not None
+    return _together(found), halves
 
 
 def propagator_of(propagator: str | Propagator) -> Propagator:

@@ -9,6 +9,7 @@ from typing import ClassVar, Protocol
 from torch import Tensor
 
 from sagemp_cli.reachability.flow import Flow
+from sagemp_cli.reachability.halves import Halves
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import Box, Tube
 
@@ -41,6 +42,7 @@ class Reach:
         recording: what a certificate keeps of the proof.
         notes: what whoever reads the tube should know, one line each.
         flow: of a loop in continuous time, what was proved between the instants.
+        halves: what halving each cell would do, foreseen.
     """
 
     tube: Tube
@@ -49,6 +51,7 @@ class Reach:
     recording: Recording | None = None
     notes: tuple[str, ...] = ()
     flow: Flow | None = None
+    halves: Halves | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.sets import Box
@@ -88,6 +89,18 @@ def partition(start: Box, counts: Sequence[int]) -> Box:
     return Box(
         torch.stack([c.lower for c in cells]).reshape(shape), torch.stack([c.upper for c in cells]).reshape(shape)
     )
+
+
+def halved(cells: Box, dimension: Tensor) -> Box:
+    """Both halves of every cell ``(C, n)``, each in a dimension of its own ``(C,)``, one after the other, ``(2C, n)``.
+
+    They share their face exactly, and so cover the cell.
+    """
+    own = torch.nn.functional.one_hot(dimension, cells.dim).bool()
+    middle = cells.center
+    lower = torch.stack([cells.lower, torch.where(own, middle, cells.lower)], 1)
+    upper = torch.stack([torch.where(own, middle, cells.upper), cells.upper], 1)
+    return Box(lower.flatten(0, 1), upper.flatten(0, 1))
 
 
 def uncertain_dimensions(start: Box) -> list[int]:

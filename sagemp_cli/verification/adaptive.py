@@ -1,9 +1,9 @@
-"""Adaptive partitions: cells are split where the proof fails, along the dimension that turns out to help most.
+"""Adaptive partitions: cells are split where the proof fails, in the state where that is foreseen to help most.
 
-A partition begins with one cell per reference. In each round every cell whose tube is not SAFE by itself is halved in
-each uncertain dimension for trial, all trials of all references in one batch, and the dimension is kept whose two
-halves together miss least. Rounds go on until all is SAFE, the budget is spent, or it is plain that a reference will
-not be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face
+A partition begins with one cell per reference. In each round every cell whose tube is not SAFE by itself is halved, in
+the state whose halves are foreseen to miss least together (:mod:`sagemp_cli.verification.cutting`), the halves of all
+references in one batch. Rounds go on until all is SAFE, the budget is spent, or it is plain that a reference will not
+be proved: a rollout breaks the claim, or splitting has not helped several times in a row. Halves share their face
 exactly (:meth:`~sagemp_cli.sets.Box.split`), so the cells always cover the start box.
 """
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.sets import Box
+from sagemp_cli.sets.partition import halved
 from sagemp_cli.verification.cells import CellTubes
 
 PATIENCE = 3
@@ -22,9 +23,6 @@ PATIENCE = 3
 
 GAIN = 0.02
 """A split is in vain if its halves miss on average more than ``1 - GAIN`` of what the whole cell missed."""
-
-_TIE = 1e-6
-"""Relative difference of what is missing below which the narrower tubes decide."""
 
 
 def adaptive_cells(
@@ -37,12 +35,12 @@ def adaptive_cells(
 ) -> CellTubes:
     """Cells that cover each start box, at most ``budget`` for each, split where it pays.
 
-    What this costs: up to ``2 d`` propagated cells for each split, d the number of uncertain dimensions.
+    What this costs: two propagated cells for each split.
 
     Args:
-        prove: ``prove(cell_reference (B,), cells (B, n))``, the tubes of cells.
+        prove: ``prove(cell_reference (B,), cells (B, n))``, the tubes of cells and where to cut them.
         start: X_I of each reference, ``(R, n)``.
-        budget: cells of one reference at most, the trials that were given up not counted.
+        budget: cells of one reference at most.
         shortfall: of cells, whether each is SAFE and how much is missing; see
             :func:`~sagemp_cli.verification.verdict.shortfall`.
         hopeless: ``hopeless(cell_reference (B,), cells (B, n))`` says of which cells a rollout is known that breaks the
@@ -64,18 +62,19 @@ def adaptive_cells(
             given_up[owners[hopeless(owners, _box(found, doubtful))]] = True
         given_up[found.cell_reference[(vain >= PATIENCE) & ~safe]] = True
         fresh.zero_()
-        chosen = _worst(found.cell_reference, safe | given_up[found.cell_reference], missing, budget)
-        parents, halves = _halves(_box(found, chosen))
-        if not len(parents):
+        assert found.cut is not None
+        done = safe | given_up[found.cell_reference] | (found.cut < 0)
+        split = _worst(found.cell_reference, done, missing, budget)
+        if not len(split):
             break
-        trial = prove(found.cell_reference[chosen[parents]].repeat_interleave(2), halves)
-        best, left = _best(parents, trial, shortfall)
-        split = chosen[parents[best]]
+        halves = halved(_box(found, split), found.cut[split])
+        made = prove(found.cell_reference[split].repeat_interleave(2), halves)
+        left = shortfall(made)[1].unflatten(0, (-1, 2)).sum(1)
         more = torch.where(left > 2 * (1 - GAIN) * missing[split], vain[split] + 1, 0)
         whole = torch.ones(len(found), dtype=torch.bool)
         whole[split] = False
-        found = CellTubes.join([found.select(torch.nonzero(whole).flatten()), trial.select(_pairs(best))])
-        fresh = torch.cat([fresh[whole], torch.ones(2 * len(best), dtype=torch.bool)])
+        found = CellTubes.join([found.select(torch.nonzero(whole).flatten()), made])
+        fresh = torch.cat([fresh[whole], torch.ones(len(made), dtype=torch.bool)])
         vain = torch.cat([vain[whole], more.repeat_interleave(2)])
     return found.select(_sorted(found))
 
@@ -93,42 +92,6 @@ def _worst(owner: Tensor, done: Tensor, missing: Tensor, budget: int) -> Tensor:
             room[owner[cell]] -= 1
             chosen.append(cell)
     return torch.tensor(chosen, dtype=torch.int64)
-
-
-def _halves(cells: Box) -> tuple[Tensor, Box]:
-    """The parent of each trial, and its two halves one after the other, ``(2 trials, n)``."""
-    parents, lowers, uppers = [], [], []
-    for parent, (low, high) in enumerate(zip(cells.lower, cells.upper, strict=True)):
-        for dimension in torch.nonzero(high > low).flatten().tolist():
-            counts = [2 if i == dimension else 1 for i in range(cells.dim)]
-            halves = Box(low, high).split(counts)
-            if bool((halves.width[:, dimension] > 0).all()):  # else there is no number between the faces
-                parents.append(parent)
-                lowers.append(halves.lower)
-                uppers.append(halves.upper)
-    none = torch.zeros(0, cells.dim, dtype=torch.float64)
-    return torch.tensor(parents, dtype=torch.int64), Box(torch.cat([none, *lowers]), torch.cat([none, *uppers]))
-
-
-def _best(
-    parents: Tensor, trial: CellTubes, shortfall: Callable[[CellTubes], tuple[Tensor, Tensor]]
-) -> tuple[Tensor, Tensor]:
-    """The trial of each parent whose halves miss least together, by narrower tubes if tied, and what those miss."""
-    missing = shortfall(trial)[1].unflatten(0, (-1, 2)).sum(1)
-    width = torch.nan_to_num(trial.tube.width, nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
-    spread = width.log().flatten(1).mean(1).unflatten(0, (-1, 2)).sum(1)
-    best = []
-    for parent in parents.unique().tolist():
-        own = torch.nonzero(parents == parent).flatten()
-        near = own[missing[own] <= missing[own].min() * (1 + _TIE)]
-        best.append(int(near[spread[near].argmin()]))
-    index = torch.tensor(best, dtype=torch.int64)
-    return index, missing[index]
-
-
-def _pairs(trials: Tensor) -> Tensor:
-    """Indices of both halves of trials."""
-    return torch.stack([2 * trials, 2 * trials + 1], dim=1).flatten()
 
 
 def _sorted(found: CellTubes) -> Tensor:

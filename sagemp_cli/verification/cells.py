@@ -25,12 +25,15 @@ from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.continuous.sampled import SampledLoop, sampled
 from sagemp_cli.reachability.flow import AskedDivision, Flow
+from sagemp_cli.reachability.foreseeing import reach_foreseeing
 from sagemp_cli.reachability.program.loops import RecordedLoop, recorded
 from sagemp_cli.reachability.program.program import Program
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets import Between, Box, Tube
+from sagemp_cli.verification.cutting import best_cut
 from sagemp_cli.verification.deviation import ComparedLoop
+from sagemp_cli.verification.verdict import shortfall
 from sagemp_cli.workers import one_thread
 
 
@@ -90,6 +93,7 @@ class CellTubes:
         recording: the relaxations used, batched ``(C,)``; None if the propagator keeps none.
         notes: of the propagator.
         flow: in continuous time, what was proved between the instants.
+        cut: in which state halving each would leave least missing, ``(C,)``; None unless asked for.
     """
 
     cell_reference: Tensor
@@ -101,6 +105,7 @@ class CellTubes:
     recording: Recording | None
     notes: tuple[str, ...] = ()
     flow: Flow | None = None
+    cut: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.cell_reference)
@@ -117,12 +122,14 @@ class CellTubes:
             None if self.recording is None else self.recording.select(index),
             self.notes,
             None if self.flow is None else self.flow.select(index),
+            None if self.cut is None else self.cut[index],
         )
 
     @staticmethod
     def join(parts: Sequence[CellTubes]) -> CellTubes:
         """All cells, one part after the other."""
         recordings = [p.recording for p in parts]
+        cuts = [p.cut for p in parts if p.cut is not None]
         if len(parts) == 1:
             return parts[0]
         return CellTubes(
@@ -135,6 +142,7 @@ class CellTubes:
             Recording.join(recordings),
             tuple(dict.fromkeys(note for p in parts for note in p.notes)),
             Flow.join([p.flow for p in parts]),
+            torch.cat(cuts) if len(cuts) == len(parts) else None,
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -149,6 +157,8 @@ class CellTubes:
             "control_upper": self.control_upper,
             "seconds": self.seconds,
         }
+        if self.cut is not None:
+            found["cut"] = self.cut
         if self.recording is not None:
             r = self.recording
             found |= {"slope": r.slope, "offset": r.offset, "radius": r.radius}
@@ -193,6 +203,7 @@ class CellTubes:
             Flow.of({name.removeprefix("flow_"): side for name, side in found.items()})
             if "flow_lower" in found
             else None,
+            found.get("cut"),
         )
 
 
@@ -207,6 +218,7 @@ class CellProver:
         compared: whether the loop is that of the analytical model of a learned robot, by way of the robot:
             :class:`~sagemp_cli.verification.deviation.ComparedLoop`.
         division: in continuous time, how the periods are to be divided.
+        foresee: whether to say of every cell in which state it is best halved.
     """
 
     propagator: Propagator
@@ -214,6 +226,7 @@ class CellProver:
     tracker: Controller
     compared: bool = False
     division: AskedDivision = AskedDivision()
+    foresee: bool = False
 
     def loop(self, references: Tensor) -> ClosedLoop:
         """What is bounded, on references ``(..., K+1, n)``."""
@@ -255,13 +268,26 @@ class CellProver:
             found.recording,
             found.notes,
             found.flow,
+            self._cut(chunk.cells, found),
         )
+
+    def _cut(self, cells: Box, found: Reach) -> Tensor | None:
+        if found.halves is None:
+            return None
+        scene, position = self.problem.scene, self.problem.dynamics.position
+
+        def missing(tube: Tube) -> Tensor:
+            between = Between.SEGMENTS if self.problem.between is Between.CONTINUOUS else self.problem.between
+            return shortfall(tube, scene, position=position, between=between)[1]
+
+        return best_cut(cells, found.tube, found.halves, missing)
 
     def _reach(self, loop: ClosedLoop, chunk: Chunk) -> Reach:
         numbers, w = loop.numbers().to(torch.float64), self.problem.disturbance
         if not loop.continuous:
             known = RecordedLoop(self._programs, numbers, loop.horizon)
-            return self.propagator.reach(known, chunk.cells, w, watch=True)
+            reach = reach_foreseeing if self.foresee else type(self.propagator).reach
+            return reach(self.propagator, known, chunk.cells, w, watch=True)
         if self.compared:
             raise UsageError(
                 "what is proved about a learned robot's analytical model is in discrete time; set "
@@ -269,7 +295,15 @@ class CellProver:
             )
         known = dataclasses.replace(self._sampled, numbers=numbers, horizon=loop.horizon)
         substeps = chunk.substeps or self.division.substeps
-        return reach_continuously(self.propagator, known, chunk.cells, w, substeps=substeps, order=self.division.order)
+        return reach_continuously(
+            self.propagator,
+            known,
+            chunk.cells,
+            w,
+            substeps=substeps,
+            order=self.division.order,
+            foresee=self.foresee,
+        )
 
 
 def loop_of(problem: Problem, tracker: Controller, references: Tensor, *, compared: bool = False) -> ClosedLoop:

@@ -20,6 +20,7 @@ from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import UsageError
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.any_loop import cells_of
+from sagemp_cli.reachability.foreseeing import reach_foreseeing
 from sagemp_cli.reachability.observed import Observed
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator
@@ -31,6 +32,7 @@ from sagemp_cli.verification.attack.ascent import simulate
 from sagemp_cli.verification.attack.falsifier import Counterexample, falsify, margins
 from sagemp_cli.verification.attack.refutation import RATES, SHORT_RATES, SoundnessError
 from sagemp_cli.verification.cells import CellTubes
+from sagemp_cli.verification.cutting import best_cut
 from sagemp_cli.verification.verdict import Answer, Outcome, Verdict, answer_of, assess, shortfall
 from sagemp_cli.verification.verification import Verification
 from sagemp_cli.workers import one_thread
@@ -129,7 +131,7 @@ def verify_loop(
     """
     if claim.scene.goal.dim != seen.start.dim or len(claim.state_names) != seen.start.dim:
         raise UsageError(f"the loop has {seen.start.dim} states, the claim speaks of {claim.scene.goal.dim}")
-    work = _Cells(seen, propagator, cells_at_once)
+    work = _Cells(seen, propagator, cells_at_once, claim if counts is None else None)
     if counts is None:
         found = adaptive_cells(
             work,
@@ -176,22 +178,26 @@ def verify_loop(
 
 
 class _Cells:
-    """Proves cells in chunks."""
+    """Proves cells in chunks, and says where they are best cut if a claim is given."""
 
-    def __init__(self, seen: Observed, propagator: Propagator, at_once: int) -> None:
-        self.seen, self.propagator, self.at_once = seen, propagator, at_once
+    def __init__(self, seen: Observed, propagator: Propagator, at_once: int, claim: LoopClaim | None) -> None:
+        self.seen, self.propagator, self.at_once, self.claim = seen, propagator, at_once, claim
 
     def __call__(self, owner: Tensor, cells: Box) -> CellTubes:
         chunks = zip(*(x.split(self.at_once) for x in (owner, cells.lower, cells.upper)), strict=True)
         return CellTubes.join([self._proved(own, Box(low, high)) for own, low, high in chunks])
 
     def _proved(self, owner: Tensor, cells: Box) -> CellTubes:
-        loop, began = self.seen.loop, time.perf_counter()
+        loop, began, claim = self.seen.loop, time.perf_counter(), self.claim
         with torch.no_grad(), one_thread():
-            found = self.propagator.reach(loop, cells, self.seen.disturbance, watch=True)
+            reach = type(self.propagator).reach if claim is None else reach_foreseeing
+            found = reach(self.propagator, loop, cells, self.seen.disturbance, watch=True)
+            cut = None
+            if found.halves is not None and claim is not None:
+                cut = best_cut(cells, found.tube, found.halves, lambda tube: _shortfall(tube, claim)[1])
         seconds = torch.full((len(owner),), (time.perf_counter() - began) / len(owner), dtype=torch.float64)
         nothing = torch.zeros(len(owner), loop.horizon, 0, dtype=torch.float64)
-        return CellTubes(owner, cells, found.tube, nothing, nothing, seconds, found.recording, found.notes)
+        return CellTubes(owner, cells, found.tube, nothing, nothing, seconds, found.recording, found.notes, cut=cut)
 
 
 def _shortfall(tube: Tube, claim: LoopClaim) -> tuple[Tensor, Tensor]:

@@ -197,6 +197,7 @@ def verify_references(
     count, n = references.shape[0], dynamics.state_dim
     references = references.to(torch.float64)
     start = Box(problem.start.lower.expand(count, n), problem.start.upper.expand(count, n))
+    prover = dataclasses.replace(prover, foresee=counts is None)
     with (executor or Serial()).opened(prover) as run:
         work = _Work(run, references, cells_at_once, pieces, progress or Silent())
         if counts is None:

@@ -9,10 +9,12 @@ from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.loop.tracker import Tracker
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.halves import Halves
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.verification.adaptive import adaptive_cells
 from sagemp_cli.verification.cells import CellProver, CellTubes
+from sagemp_cli.verification.cutting import best_cut
 from sagemp_cli.verification.verdict import Outcome
 from sagemp_cli.verification.verification import verify_references
 
@@ -29,7 +31,9 @@ class Stretched:
         reach = (cells.width * self.factors).amax(-1, keepdim=True).clamp(min=self.floor).expand(cells.width.shape)
         tube = Tube(torch.stack([cells.lower, -reach], 1), torch.stack([cells.upper, reach], 1))
         none = torch.zeros(len(owner), 1, 1, dtype=torch.float64)
-        return CellTubes(owner, cells, tube, none, none, none[:, 0, 0], None)
+        cut = (cells.width * self.factors).argmax(-1)
+        cut = torch.where((cells.center == cells.lower).all(-1), -1, cut)
+        return CellTubes(owner, cells, tube, none, none, none[:, 0, 0], None, cut=cut)
 
     def shortfall(self, found):
         tube = found.tube
@@ -69,10 +73,10 @@ def test_references_get_the_cells_they_need_and_no_more_than_the_budget():
     assert found.cell_reference.tolist() == sorted(found.cell_reference.tolist())
 
 
-def test_all_trials_of_a_round_are_one_call():
+def test_all_halves_of_a_round_are_one_call_and_nothing_else_is_propagated():
     model = Stretched([4.0, 0.1])
     split(model, boxes([1.0, 1.0], [1.0, 1.0]))
-    assert model.calls == [2, 2 * 4, 4 * 4]
+    assert model.calls == [2, 2 * 2, 4 * 2]
 
 
 @pytest.mark.parametrize("budget", [1, 2, 5, 13])
@@ -101,6 +105,22 @@ def test_a_reference_with_a_violating_rollout_is_split_no_further():
 def test_splitting_that_does_not_help_ends_before_the_budget():
     found = split(Stretched([1.0, 1.0], floor=2.0), boxes([1.0, 1.0]), budget=1000)
     assert len(found) == 8
+
+
+def test_a_cell_is_cut_where_its_halves_are_foreseen_to_miss_least_and_then_to_be_narrowest():
+    cells = boxes([1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0])
+    zeros = torch.zeros(4, 3, 2, 3, dtype=torch.float64)
+    tube = Tube(zeros[:, 0], zeros[:, 0] + 4.0)
+    narrowing = zeros.clone()
+    narrowing[:, 0, 1, 0], narrowing[:, 1, 1, 1], narrowing[:, 2, 1, 1] = 1.0, 0.5, 0.25
+    halves = Halves(zeros, narrowing)
+
+    def missing(found):  # of the cells only the first is asked for the first state
+        second = found.width[:, 1, 1]
+        return torch.where(torch.arange(8) < 2, found.width[:, 1, 0], second)
+
+    assert best_cut(cells, tube, halves, missing).tolist() == [0, 1, 1, -1]
+    assert best_cut(cells, tube, halves, lambda found: torch.zeros(8)).tolist() == [0, 0, 1, -1]
 
 
 def test_a_box_with_no_number_inside_is_not_split():

@@ -29,6 +29,7 @@ from sagemp_cli.reachability.affine.boxed import Boxed
 from sagemp_cli.reachability.affine.compiled.hints import Hints
 from sagemp_cli.reachability.affine.compiled.run import BLOCK, Done, Steps
 from sagemp_cli.reachability.affine.compiled.steps import KeptStep
+from sagemp_cli.reachability.affine.halving import Halving
 from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
@@ -51,6 +52,7 @@ class AffineRun:
         watched_lower, watched_upper: bounds of controls and deviations ``(*batch, K, m)``; None unless asked for.
         notes: what whoever reads the tube should know.
         last: the set after the last step, for all B cells.
+        halving: what halving the cells would do, followed up to there; None unless asked for.
     """
 
     tube: Tube
@@ -61,6 +63,7 @@ class AffineRun:
     watched_upper: Tensor | None = None
     notes: tuple[str, ...] = ()
     last: Zonotope | None = field(default=None, repr=False)
+    halving: Halving | None = field(default=None, repr=False)
 
     @property
     def alike(self) -> bool:
@@ -89,17 +92,21 @@ class Affine(Propagator):
             raise ConfigError(f"propagator.symbols must be a positive integer or null, found {self.symbols}")
 
     @torch.no_grad()
-    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False) -> Reach:
-        """See :class:`~sagemp_cli.reachability.propagator.Propagator`."""
+    def reach(self, loop: Loop, start: Box, disturbance: Box, *, watch: bool = False, foresee: bool = False) -> Reach:
+        """See :class:`~sagemp_cli.reachability.propagator.Propagator`; with ``foresee`` also what halving cells
+        ``(C, n)`` would do.
+        """
         strangers = isinstance(loop, RecordedLoop) and any(p.outputs.control is None for p in loop.programs)
-        run = self.run(loop, start, disturbance, watch=watch and not strangers)
+        halving = Halving(start) if foresee else None
+        run = self.run(loop, start, disturbance, watch=watch and not strangers, halving=halving)
         recording = run.recording() if watch and run.alike else None
+        halves = None if run.halving is None else run.halving.halves(loop.horizon)
         lower, upper = run.watched_lower, run.watched_upper
         if lower is None or upper is None:
-            return Reach(run.tube, recording=recording, notes=run.notes)
+            return Reach(run.tube, recording=recording, notes=run.notes, halves=halves)
         bad = torch.isnan(lower) | torch.isnan(upper)
         lower, upper = torch.where(bad, -math.inf, lower), torch.where(bad, math.inf, upper)
-        return Reach(run.tube, lower, upper, recording, run.notes)
+        return Reach(run.tube, lower, upper, recording, run.notes, halves=halves)
 
     def footprint(self, size: LoopSize) -> Footprint:
         """Of M generators at the last step, as many as if none were negligible: ``6 M n + 12 v^2`` numbers, ``10 v``
@@ -127,6 +134,7 @@ class Affine(Propagator):
         watch: bool = False,
         states: Zonotope | None = None,
         intervals: bool = True,
+        halving: Halving | None = None,
     ) -> AffineRun:
         """Propagate, and keep what else is asked for; differentiable where autograd is on and something wants it.
 
@@ -139,6 +147,7 @@ class Affine(Propagator):
             watch: bound the controls, and the deviations of a learned robot that is compared with its model.
             states: the set to begin with, of arrays, for all B cells, where that is more than its box ``start``.
             intervals: whether values have an interval beside their form, where nothing is differentiated.
+            halving: of cells ``(B, n)``, followed from here on (a copy is), where nothing is differentiated.
 
         Raises:
             UsageError: a loop that is to be watched does not say what its controls are.
@@ -154,7 +163,7 @@ class Affine(Propagator):
         sides = start.lower.reshape(-1, n), start.upper.reshape(-1, n)
         low, high = sides if differentiated else (side.numpy() for side in sides)
         steps = Steps(known, disturbance, batch, tensors=differentiated, watch=watch)
-        first = _Course(states, low, high, Boxed(self.symbols))
+        first = _Course(states, low, high, Boxed(self.symbols), halving)
         count = loop.horizon if horizon is None else horizon
         # A cell has intervals at all steps or at none, so that its tube is the same whatever cells are beside it.
         carrying = np.zeros_like(steps.every_cell) if intervals and not differentiated else None
@@ -180,7 +189,17 @@ class Affine(Propagator):
             )
         )
         low, high = [_in_batch(side, batch) for side in zip(*course.controls, strict=True)] or (None, None)
-        return AffineRun(tube, course.bands, course.masks, course.kept, low, high, course.boxed.notes(), course.states)
+        return AffineRun(
+            tube,
+            course.bands,
+            course.masks,
+            course.kept,
+            low,
+            high,
+            course.boxed.notes(),
+            course.states,
+            course.halving,
+        )
 
 
 @dataclass
@@ -191,6 +210,7 @@ class _Course:
         states: the set that was reached.
         low, high: its bounds, which may be tighter, ``(B, n)``.
         boxed: what boxing cost.
+        halving: what halving the cells would do, if it is asked for.
         again: number of generators from which on it is looked for some to drop.
         lows, highs, bands, masks, controls, kept: of the steps taken.
     """
@@ -199,6 +219,7 @@ class _Course:
     low: Any
     high: Any
     boxed: Boxed
+    halving: Halving | None = None
     again: int = 0
     lows: list[Any] = field(default_factory=list)
     highs: list[Any] = field(default_factory=list)
@@ -215,7 +236,8 @@ class _Course:
     def copy(self) -> _Course:
         """One that does not change with this."""
         lists = {name: list(value) for name, value in vars(self).items() if isinstance(value, list)}
-        return dataclasses.replace(self, boxed=copy.copy(self.boxed), **lists)
+        halving = None if self.halving is None else self.halving.copy()
+        return dataclasses.replace(self, boxed=copy.copy(self.boxed), halving=halving, **lists)
 
     def take(self, done: Done, *, keep_steps: bool, symbols: int | None) -> None:
         """A step."""
@@ -225,6 +247,8 @@ class _Course:
             self.controls.append(done.watched)
         if keep_steps:
             self.kept.append(KeptStep.of(frame, after))
+        if self.halving is not None:
+            self.halving.follow(frame, after)
         mask, n = np.ones(states.order, dtype=bool), states.dim
         # Looking for generators to drop costs as much as a step: only when there are a good deal more than before.
         if states.order > (self.again if symbols is None else max(symbols, n + 1)):

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.affine.affine import Affine, AffineRun
+from sagemp_cli.reachability.affine.halving import Halving
 from sagemp_cli.reachability.continuous.enclosure import enclosure
 from sagemp_cli.reachability.continuous.expansion import Expansion, expansion
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
@@ -103,15 +104,19 @@ class _Block:
 
 
 @torch.no_grad()
-def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: Division) -> FlowRun:
+def propagated(
+    affine: Affine, loop: SampledLoop, start: Box, w: Box, division: Division, *, foresee: bool = False
+) -> FlowRun:
     """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
 
-    Rows of the tube after a period in which no enclosure was found are infinite.
+    Rows of the tube after a period in which no enclosure was found are infinite. What halving the cells would do is
+    followed if it is to be foreseen; of remainders it knows nothing.
     """
     programs = expansion(loop, division)
     cells, n, s = start.lower.shape[0], loop.state_dim, division.substeps
     blocks: list[_Block] = []
     states: Zonotope | None = None
+    halving = Halving(start) if foresee else None
     guess = torch.zeros(2, 1, cells, s, n, dtype=torch.float64)
     failed = torch.full((cells,), loop.horizon)
     at, length, here = 0, _FIRST, start
@@ -119,12 +124,12 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
         stop = min(at + length, loop.horizon)
         part = RecordedLoop((programs.step,), loop.numbers[at:stop], stop - at)
         signal = w if w.lower.dim() == 1 else Box(w.lower[at:stop], w.upper[at:stop])
-        block = _block(affine, part, programs, here, states, signal, guess)
+        block = _block(affine, part, programs, here, _Begin(states, halving), signal, guess)
         blocks.append(block)
         bad = ~block.holds
         first = torch.where(bad.any(1), bad.to(torch.int8).argmax(1) + at, loop.horizon)
         failed = torch.minimum(failed, first)
-        states = block.run.last
+        states, halving = block.run.last, block.run.halving
         here = Box(*(_settled(side[:, -1]) for side in (block.run.tube.lower, block.run.tube.upper)))
         guess = block.extrapolated()
         at, length = stop, min(2 * length, _LONGEST)
@@ -140,6 +145,14 @@ def propagated(affine: Affine, loop: SampledLoop, start: Box, w: Box, division: 
     return FlowRun(dataclasses.replace(run, tube=tube, bands=[] if rest else run.bands), between, failed)
 
 
+@dataclass(frozen=True)
+class _Begin:
+    """How far earlier periods came: the set, and what halving the cells would do; see :meth:`.Affine.run`."""
+
+    states: Zonotope | None
+    halving: Halving | None
+
+
 def _settled(side: Tensor) -> Tensor:
     return torch.nan_to_num(side, nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -149,21 +162,21 @@ def _block(
     part: RecordedLoop,
     programs: Expansion,
     start: Box,
-    states: Zonotope | None,
+    begin: _Begin,
     w: Box,
     guess: Tensor,
 ) -> _Block:
     """Some periods in a row, beginning with ``guess (2, 1 or K, C, S, n)`` of their remainders."""
     for _ in range(_ATTEMPTS - 1):
-        block = _attempt(affine, part, programs, start, states, w, guess)
+        block = _attempt(affine, part, programs, start, begin, w, guess)
         if bool(block.settled.all()):
             return block
         guess = block.widened()
-    return _attempt(affine, part, programs, start, states, w, guess)
+    return _attempt(affine, part, programs, start, begin, w, guess)
 
 
 def _attempt(
-    affine: Affine, part: RecordedLoop, programs: Expansion, start: Box, states: Zonotope | None, w: Box, guess: Tensor
+    affine: Affine, part: RecordedLoop, programs: Expansion, start: Box, begin: _Begin, w: Box, guess: Tensor
 ) -> _Block:
     """The same with one guess."""
     cells, n = start.lower.shape
@@ -171,7 +184,7 @@ def _attempt(
     guess = guess.expand(2, steps, cells, s, n)
     signal = [side.expand(steps, n)[:, None, None].expand(steps, cells, s, n) for side in (w.lower, w.upper)]
     sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
-    run = affine.run(part, start, Box(*sides), watch=True, states=states, intervals=False)
+    run = affine.run(part, start, Box(*sides), watch=True, states=begin.states, intervals=False, halving=begin.halving)
     state, control = _boxes(run, n, s)
     each = Box(*(side.transpose(0, 1).reshape(-1, n) for side in signal))
     found = enclosure(programs, state, control, w if w.lower.dim() == 1 else each)
@@ -229,4 +242,5 @@ def _joined(runs: Sequence[AffineRun]) -> AffineRun:
         watched("watched_upper"),
         tuple(dict.fromkeys(note for r in runs for note in r.notes)),
         runs[-1].last,
+        runs[-1].halving,
     )

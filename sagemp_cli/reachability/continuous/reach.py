@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -35,6 +36,7 @@ def reach_continuously(
     *,
     substeps: int | None = None,
     order: int | None = None,
+    foresee: bool = False,
 ) -> Reach:
     """Enclosures at the instants and between them, of every solution from ``start (C, n)`` under every measurable
     signal in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
@@ -46,6 +48,7 @@ def reach_continuously(
         substeps: parts of a period, a power of two; None begins with one and doubles while there is a period in which
             no enclosure is found and more parts leave fewer of them.
         order: degree of the Taylor polynomials, :data:`ORDER` by default.
+        foresee: whether to say what halving each cell would do.
 
     Raises:
         UsageError: boxes or numbers that do not fit.
@@ -70,13 +73,14 @@ def reach_continuously(
         raise UsageError(f"order must be at least 1, found {order}")
     best: FlowRun | None = None
     for parts in [substeps] if substeps else _doubling():
-        found = propagated(propagator, known, start, w, Division(parts, order))
+        found = propagated(propagator, known, start, w, Division(parts, order), foresee=foresee)
         left, before = _missing(found), math.inf if best is None else _missing(best)
         best = found if left < before else best
         if left == 0 or known.horizon - left > 0 and left > _PROGRESS * before:
             break
     assert best is not None
-    return _result(best, known, propagator)
+    halving = best.run.halving
+    return dataclasses.replace(_result(best, known), halves=None if halving is None else halving.halves(known.horizon))
 
 
 def polynomial_steps(loop: Sampled | SampledLoop, start: Box, w: Box) -> tuple[RecordedLoop, Box]:
@@ -100,7 +104,7 @@ def _doubling() -> Iterator[int]:
     return itertools.takewhile(lambda parts: parts <= MOST_SUBSTEPS, (2**i for i in itertools.count()))
 
 
-def _result(found: FlowRun, loop: SampledLoop, affine: Affine) -> Reach:
+def _result(found: FlowRun, loop: SampledLoop) -> Reach:
     run, m, parts = found.run, loop.controls, found.flow.division.substeps
     notes, first = list(run.notes), int(found.failed.amin())
     if first < loop.horizon:

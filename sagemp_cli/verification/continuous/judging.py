@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.reachability.continuous.margins import Observable, along, observable
+from sagemp_cli.reachability.continuous.margins import Observable, along, at_boxes, observable
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.propagator import Reach
 from sagemp_cli.scenes.requirements import Formula
-from sagemp_cli.sets import Box
+from sagemp_cli.sets import Box, Tube
 
 _NEAR = 1e-6
 """Share of a part by which a time may differ from an end that it means."""
@@ -111,6 +111,19 @@ def judged(reach: Reach, asked: Sequence[Asked], loop: SampledLoop, w: Box) -> J
     margin, time = (torch.stack([row[i] for row in rows], 1) if rows else nothing for i in (0, 1))
     holds = torch.stack([row[2] for row in rows], 1) if rows else bounded[:, None]
     return Judgement(margin, time, holds, torch.where(holds.all(1), 0.0, missing))
+
+
+def foreseen_missing(tube: Tube, asked: Sequence[Asked], loop: SampledLoop) -> Tensor:
+    """How much tubes at the instants, and what lies between their boxes, would miss, ``(C,)``; it proves nothing."""
+    lower, upper = torch.nan_to_num(tube.lower, nan=-torch.inf), torch.nan_to_num(tube.upper, nan=torch.inf)
+    over = torch.minimum(lower[:, 1:], lower[:, :-1]), torch.maximum(upper[:, 1:], upper[:, :-1])
+    missing = torch.zeros(len(lower), dtype=torch.float64)
+    for one in asked:
+        found = zip(one.times(loop, 1), (Box(lower, upper), Box(*over)), strict=True)
+        margins = torch.cat([one.worst(at_boxes(one.margins, boxes)[0])[:, when] for when, boxes in found], 1)
+        margins = torch.nan_to_num(margins, nan=-_HUGE, neginf=-_HUGE)
+        missing = missing + torch.log1p((-margins).clamp(0.0, _HUGE)).mean(1)
+    return missing
 
 
 _HUGE = 1e300

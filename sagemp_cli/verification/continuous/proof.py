@@ -1,8 +1,8 @@
 """The verdict about a loop in continuous time: attacked, bounded cell by cell, judged.
 
 Cells whose proof fails are tried again. Where the remainders of the Taylor polynomials are a noticeable share of the
-tube, more parts a period are taken; else the cells are halved, in the state whose halves miss least together: it is
-looked for in the cell that misses most, and all are halved in it, since a batch of cells costs little more than one.
+tube, more parts a period are taken; else the cells are halved, each in the state whose halves are foreseen to miss
+least together.
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ from sagemp_cli.reachability.continuous.observed import ObservedOde
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.flow import Division, Flow
+from sagemp_cli.reachability.halves import Halves
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.scenes.requirements import Formula
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.partition import halved
 from sagemp_cli.verification.continuous.attack import Violation, search
-from sagemp_cli.verification.continuous.judging import Asked, Judgement, judged
+from sagemp_cli.verification.continuous.judging import Asked, Judgement, foreseen_missing, judged
+from sagemp_cli.verification.cutting import best_cut
 from sagemp_cli.verification.verdict import Answer
 
 _PATIENCE = 3
@@ -64,6 +67,7 @@ class Piece:
                 control_upper=controls[1],
                 recording=None if r.recording is None else r.recording.select(index),
                 flow=r.flow.select(index),
+                halves=None if r.halves is None else r.halves.select(index),
             ),
             Judgement(j.margin[index], j.time[index], j.holds[index], j.missing[index]),
         )
@@ -289,66 +293,39 @@ class _Work:
         bounded = bool(torch.isfinite(reach.tube.upper).all() & torch.isfinite(reach.tube.lower).all())
         return bool((remainder_share(reach) > (FINE if bounded else ENOUGH)).any())
 
-    def piece(self, cells: Box, division: Division) -> Piece:
+    def piece(self, cells: Box, division: Division, *, foresee: bool = False) -> Piece:
         """Cells bounded and judged."""
-        reaches = [
-            reach_continuously(
-                self.propagator,
-                self.loop,
-                Box(low, high),
-                self.w,
-                substeps=division.substeps,
-                order=division.order,
-            )
-            for low, high in zip(cells.lower.split(self.at_once), cells.upper.split(self.at_once), strict=True)
-        ]
-        reach = _joined(reaches)
+        reach = self.reach(cells, division, foresee)
         return Piece(cells, reach, judged(reach, self.asked, self.loop, self.w))
 
+    def reach(self, cells: Box, division: Division, foresee: bool) -> Reach:
+        """Cells bounded."""
+        return _joined(
+            [
+                reach_continuously(
+                    self.propagator,
+                    self.loop,
+                    Box(low, high),
+                    self.w,
+                    substeps=division.substeps,
+                    order=division.order,
+                    foresee=foresee,
+                )
+                for low, high in zip(cells.lower.split(self.at_once), cells.upper.split(self.at_once), strict=True)
+            ]
+        )
+
     def halved(self, piece: Piece, division: Division) -> Piece | None:
-        """The halves of all cells; None if they cannot be halved.
+        """The halves of all cells, each in the state whose halves are foreseen to miss least; None if one cannot be."""
+        reach = piece.reach  # the first cells were not asked what halving would do: most often they are enough
+        reach = self.reach(piece.cells, division, True) if reach.halves is None else reach
+        assert reach.halves is not None
 
-        Each in the state whose halves miss least together. Where trials of all would be more than one call, all are
-        halved in the state that is best for the one that misses most.
-        """
-        count = len(piece.cells.lower)
-        dimensions = [
-            i
-            for i in torch.nonzero(piece.cells.width.amin(0) > 0)[:, 0].tolist()
-            if bool((_halved(piece.cells, i).width[:, i] > 0).all())
-        ]
-        if not dimensions:
-            return None
-        if len(dimensions) == 1:
-            return self.piece(_halved(piece.cells, dimensions[0]), division)
-        together = 2 * count * len(dimensions) <= self.at_once
-        tried = piece.cells if together else _row(piece.cells, int(piece.judgement.missing.argmax()))
-        halves = [_halved(tried, i) for i in dimensions]
-        trial = self.piece(Box(*(torch.cat([getattr(h, s) for h in halves]) for s in ("lower", "upper"))), division)
-        shape = (len(dimensions), len(tried.lower), 2)
-        missing = trial.judgement.missing.reshape(shape).sum(2)
-        width = torch.nan_to_num(trial.reach.tube.width[:, 1:], nan=1e300, posinf=1e300).clamp(1e-300, 1e300)
-        spread = width.log().mean((1, 2)).reshape(shape).sum(2)
-        # Of those that miss least, up to rounding, the one with the narrowest tubes.
-        tied = missing <= missing.amin(0) * (1 + 1e-6)
-        best = torch.where(tied, spread, torch.inf).argmin(0)
-        if not together:
-            return self.piece(_halved(piece.cells, dimensions[int(best[0])]), division)
-        index = torch.arange(trial.cells.lower.shape[0]).reshape(shape)[best, torch.arange(count)].flatten()
-        return trial.of(index)
+        def missing(tube: Tube) -> Tensor:
+            return foreseen_missing(tube, self.asked, self.loop)
 
-
-def _row(cells: Box, index: int) -> Box:
-    return Box(cells.lower[index : index + 1], cells.upper[index : index + 1])
-
-
-def _halved(cells: Box, dimension: int) -> Box:
-    """Both halves of every cell, one after the other; they share their face exactly."""
-    middle = cells.center[:, dimension]
-    lower, upper = (side.repeat_interleave(2, 0) for side in (cells.lower, cells.upper))
-    upper[0::2, dimension] = middle
-    lower[1::2, dimension] = middle
-    return Box(lower, upper)
+        cut = best_cut(piece.cells, reach.tube, reach.halves, missing)
+        return None if bool((cut < 0).any()) else self.piece(halved(piece.cells, cut), division, foresee=True)
 
 
 def _joined(reaches: Sequence[Reach]) -> Reach:
@@ -365,6 +342,7 @@ def _joined(reaches: Sequence[Reach]) -> Reach:
         Recording.join([r.recording for r in reaches]),
         tuple(dict.fromkeys(note for r in reaches for note in r.notes)),
         Flow.join(flows),
+        Halves.join([r.halves for r in reaches]),
     )
 
 
