@@ -23,11 +23,12 @@ TUBE_UNBOUNDED = "tube unbounded"
 REASONS = (REFERENCE_COLLIDES, REFERENCE_MISSES, TUBE_COLLIDES, TUBE_MISSES, TUBE_UNBOUNDED)
 """Why a reference is not added to the library; the first two are found without propagating anything."""
 
-_OF_OUTCOME = {
+REASON_OF = {
     Outcome.MAY_COLLIDE: TUBE_COLLIDES,
     Outcome.MISSES_GOAL: TUBE_MISSES,
     Outcome.UNBOUNDED: TUBE_UNBOUNDED,
 }
+"""The reason that an outcome of a proof is."""
 
 
 class NothingCertifiedError(SagempError):
@@ -105,7 +106,7 @@ def build_library(
                 found = verify(references[sound])
                 for r, verdict in zip(sound, found.verdicts, strict=True):
                     if verdict.outcome is not Outcome.SAFE:
-                        why[r] = _OF_OUTCOME[verdict.outcome]
+                        why[r] = REASON_OF[verdict.outcome]
                 safe = found.safe[: wanted - have]
                 if safe:
                     certified.append(found.select(safe))

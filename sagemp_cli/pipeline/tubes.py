@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.reachability.flow import Division, Flow
@@ -124,6 +129,27 @@ def verification_of(record: Tubes, where: str) -> Verification:
         recording=None,
         between=Between(record.between),
     )
+
+
+def selected(tubes: Tubes, references: NDArray[np.integer]) -> Tubes:
+    """The same for some of the references, in the given order, with their cells; by the declared dimensions."""
+    cells = [np.flatnonzero(tubes.cell_reference == r) for r in references]
+    owner = np.repeat(np.arange(len(cells)), [len(c) for c in cells])
+    index = {"count": np.asarray(references), "cells": np.concatenate([np.zeros(0, np.int64), *cells])}
+    return dataclasses.replace(_taken(tubes, index), cell_reference=owner)
+
+
+def _taken(record: Any, index: Mapping[str, NDArray[np.integer]]) -> Any:
+    """A record with some entries of each array whose first dimension is named."""
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value, first = getattr(record, field.name), field.metadata.get("dims", ("",))[0]
+        if dataclasses.is_dataclass(value):
+            changed[field.name] = _taken(value, index)
+        elif first in index and value is not None:
+            picked = index[first]
+            changed[field.name] = value[picked] if isinstance(value, np.ndarray) else tuple(value[i] for i in picked)
+    return dataclasses.replace(record, **changed)
 
 
 def counterexample_record(reference: int, found: Found, constraint: str) -> Counterexample:

@@ -194,18 +194,7 @@ def _measure(
         finite = torch.cat([finite[..., :1, :], finite[..., 1:, :] & known], dim=-2)
     everywhere = torch.full_like(tube.lower, torch.inf)
     lower, upper = torch.where(finite, tube.lower, -everywhere), torch.where(finite, tube.upper, everywhere)
-    index = list(position)
-    places = Tube(lower[..., index], upper[..., index])
-    if between is Between.SAMPLES:
-        over = Box(places.lower, places.upper)
-    else:
-        bends = None
-        if lines is not None:
-            fine, bulge = lines
-            places = Tube(fine.lower[..., index], fine.upper[..., index])
-            bends = Bulge(*(b[..., index] for b in (bulge.curve, bulge.swing, bulge.rest)))
-        parts = over_steps(places, bends)
-        over = Box(parts.lower.flatten(-3, -2), parts.upper.flatten(-3, -2))
+    over = positions_over_time(Tube(lower, upper), position, between, lines)
     goal_margin = torch.minimum(
         _margin(lower[..., -1, :], scene.goal.lower), _margin(-upper[..., -1, :], -scene.goal.upper)
     )
@@ -215,6 +204,23 @@ def _measure(
         goal_margin,
         scene.goal.contains(Box(lower[..., -1, :], upper[..., -1, :])),
     )
+
+
+def positions_over_time(
+    tube: Tube, position: Sequence[int], between: Between, lines: tuple[Tube, Bulge] | None = None
+) -> Box:
+    """Boxes ``(C, P, d)`` of the positions over all parts of all steps in turn, or at the samples."""
+    index = list(position)
+    places = Tube(tube.lower[..., index], tube.upper[..., index])
+    if between is Between.SAMPLES:
+        return Box(places.lower, places.upper)
+    bends = None
+    if lines is not None:
+        fine, bulge = lines
+        places = Tube(fine.lower[..., index], fine.upper[..., index])
+        bends = Bulge(*(b[..., index] for b in (bulge.curve, bulge.swing, bulge.rest)))
+    parts = over_steps(places, bends)
+    return Box(parts.lower.flatten(-3, -2), parts.upper.flatten(-3, -2))
 
 
 def _least(values: Tensor, owner: Tensor, count: int) -> Tensor:
