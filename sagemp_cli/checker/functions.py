@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from sagemp_cli.checker.balls import Unproved, arb, ball
+from sagemp_cli.checker.jumps import JUMPS, Sawtooth, Staircase, fmod, remainder
 
 _MOST_SPLITS = 4096
 _NEWTON_STEPS = 16
@@ -36,12 +37,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Smooth:
-    """A twice differentiable function: its value and its first two derivatives on balls."""
+    """A twice differentiable function: its value and its first two derivatives on balls; of the second one the sign is
+    enough where the ball is no number.
+    """
 
     value: Callable[[arb], arb]
     first: Callable[[arb], arb]
     second: Callable[[arb], arb]
-    concave: bool = False  # wherever it is defined, though the second derivative may be infinite at an end
+    bend: int = 0  # 1 or -1: its sign wherever it is defined, though it may be infinite at an end
 
     def excess(self, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
         """See the module."""
@@ -51,7 +54,7 @@ class Smooth:
         least, most = ends[0].min(ends[1]), ends[0].max(ends[1])
         while todo:
             low, high = todo.pop()
-            curvature = arb(-1) if self.concave and least.is_finite() else self.second(low.union(high))
+            curvature = arb(self.bend) if self.bend and least.is_finite() else self.second(low.union(high))
             if curvature >= 0:
                 least = least.min(self._tangent(slope, low, high, arb.min))
             elif curvature <= 0:
@@ -125,8 +128,8 @@ class Function:
         return found
 
 
-def _smooth(value: Callable, first: Callable, second: Callable, *, concave: bool = False) -> Function:
-    return Function(((None, Smooth(value, first, second, concave), None),))
+def _smooth(value: Callable, first: Callable, second: Callable, *, bend: int = 0) -> Function:
+    return Function(((None, Smooth(value, first, second, bend), None),))
 
 
 def _line(a: float, b: float = 0.0) -> Line:
@@ -151,6 +154,91 @@ def _tan_second(x: arb) -> arb:
     return 2 * x.tan() * x.sec() ** 2
 
 
+def _signed(sign: Callable[[arb], arb], size: Callable[[arb], arb]) -> Callable[[arb], arb]:
+    """A product whose second factor is positive, and left out where the argument is no number: of a wide ball it says
+    nothing.
+    """
+    return lambda x: sign(x) * size(x) if x.rad() == 0 else sign(x)
+
+
+def _normal(x: arb) -> arb:
+    """The distribution of a standard normal number."""
+    return (-x / arb(2).sqrt()).erfc() / 2
+
+
+def _bell(x: arb) -> arb:
+    """Its density."""
+    return (-x * x / 2).exp() / (2 * arb.pi()).sqrt()
+
+
+_GELU_SCALE, _GELU_CUBIC = 0.7978845608028654, 0.044715
+"""The numbers of GELU's tanh form: c and d of ``x (1 + tanh(c (x + d x^3))) / 2 = x sigmoid(p)``."""
+
+
+def _gelu_inner(x: arb) -> tuple[arb, arb, arb]:
+    """p and its derivatives."""
+    c, d = 2 * ball(_GELU_SCALE), ball(_GELU_CUBIC)
+    return c * (x + d * x**3), c * (1 + 3 * d * x**2), 6 * c * d * x
+
+
+def _gelu_tanh_first(x: arb) -> arb:
+    p, rise, _ = _gelu_inner(x)
+    return _sigmoid(p) * (1 + x * _sigmoid(-p) * rise)
+
+
+def _gelu_tanh_bend(x: arb) -> arb:
+    p, rise, bend = _gelu_inner(x)
+    return 2 * rise + x * bend - x * rise**2 * (p / 2).tanh()
+
+
+def _gelu_tanh_size(x: arb) -> arb:
+    p, *_ = _gelu_inner(x)
+    return _sigmoid(p) * _sigmoid(-p)
+
+
+def _mish_left() -> Smooth:
+    """Mish ``x n / (n + 2)`` with ``n = e (e + 2)``, ``e = exp(x)``, left of 0."""
+
+    def over(e: arb) -> arb:
+        return e * (e + 2) + 2
+
+    def first(x: arb) -> arb:
+        e = x.exp()
+        return e * (e + 2) / over(e) + x * 4 * e * (1 + e) / over(e) ** 2
+
+    def bend(x: arb) -> arb:
+        e = x.exp()
+        return 2 * (e + 1) * over(e) + x * (2 + 2 * e - 3 * e**2 - 2 * e**3)
+
+    size = _signed(bend, lambda x: 4 * x.exp() / over(x.exp()) ** 3)
+    return Smooth(lambda x: x * x.exp() * (x.exp() + 2) / over(x.exp()), first, size)
+
+
+def _mish_right() -> Smooth:
+    """The same in terms of ``q = exp(-x)``, right of 0."""
+
+    def over(q: arb) -> arb:
+        return 1 + 2 * q + 2 * q**2
+
+    def first(x: arb) -> arb:
+        q = (-x).exp()
+        return (1 + 2 * q) / over(q) + x * 4 * (1 + q) * q**2 / over(q) ** 2
+
+    def bend(x: arb) -> arb:
+        q = (-x).exp()
+        return 2 * (1 + q) * over(q) + x * (2 * q**3 + 2 * q**2 - 3 * q - 2)
+
+    size = _signed(bend, lambda x: 4 * (-2 * x).exp() / over((-x).exp()) ** 3)
+    return Smooth(lambda x: x * (1 + 2 * (-x).exp()) / over((-x).exp()), first, size)
+
+
+_SOFTSIGN = (
+    Smooth(lambda x: x / (1 - x), lambda x: 1 / (1 - x) ** 2, lambda x: 2 / (1 - x) ** 3),
+    Smooth(lambda x: x / (1 + x), lambda x: 1 / (1 + x) ** 2, lambda x: -2 / (1 + x) ** 3),
+)
+_PARABOLA = Smooth(lambda x: x * (x + 3) / 6, lambda x: (2 * x + 3) / 6, lambda x: arb(1) / 3)
+
+
 FUNCTIONS: dict[str, Function] = {
     "sin": _smooth(arb.sin, arb.cos, lambda x: -x.sin()),
     "cos": _smooth(arb.cos, lambda x: -x.sin(), lambda x: -x.cos()),
@@ -163,9 +251,21 @@ FUNCTIONS: dict[str, Function] = {
         lambda x: _sigmoid(x) * _sigmoid(-x) * (_sigmoid(-x) - _sigmoid(x)),
     ),
     "silu": _smooth(lambda x: x * _sigmoid(x), _silu_first, _silu_second),
+    "gelu": _smooth(lambda x: x * _normal(x), lambda x: _normal(x) + x * _bell(x), _signed(lambda x: 2 - x * x, _bell)),
+    "gelu_tanh": _smooth(
+        lambda x: x * _sigmoid(_gelu_inner(x)[0]), _gelu_tanh_first, _signed(_gelu_tanh_bend, _gelu_tanh_size)
+    ),
+    "mish": Function(((None, _mish_left(), 0.0), (0.0, _mish_right(), None))),
+    "softsign": Function(((None, _SOFTSIGN[0], 0.0), (0.0, _SOFTSIGN[1], None))),
+    "hardswish": Function(((None, _line(0.0), -3.0), (-3.0, _PARABOLA, 3.0), (3.0, _line(1.0), None))),
+    "erf": _smooth(
+        arb.erf,
+        lambda x: 2 * (-x * x).exp() / arb.pi().sqrt(),
+        _signed(lambda x: -x, lambda x: 4 * (-x * x).exp() / arb.pi().sqrt()),
+    ),
     "exp": _smooth(arb.exp, arb.exp, arb.exp),
     "log": _smooth(arb.log, lambda x: 1 / x, lambda x: -1 / x**2),
-    "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt()), concave=True),
+    "sqrt": _smooth(arb.sqrt, lambda x: 1 / (2 * x.sqrt()), lambda x: -1 / (4 * x * x.sqrt()), bend=-1),
     "reciprocal": _smooth(lambda x: 1 / x, lambda x: -1 / x**2, lambda x: 2 / x**3),
     "identity": Function(((None, _line(1.0), None),)),
     "abs": Function(((None, _line(-1.0), 0.0), (0.0, _line(1.0), None))),
@@ -206,6 +306,19 @@ def integer_power(exponent: int) -> Function:
     return _smooth(lambda x: x**p, lambda x: p * x ** (p - 1), lambda x: p * (p - 1) * x ** (p - 2))
 
 
+def power(exponent: float) -> Function:
+    """``x^p``; for a p that is not whole that of ``x >= 0``."""
+    if exponent == int(exponent):
+        return integer_power(int(exponent))
+    p = ball(exponent)
+    return _smooth(
+        lambda x: x**p,
+        lambda x: p * x ** (p - 1),
+        lambda x: p * (p - 1) * x ** (p - 2),
+        bend=-1 if 0 < exponent < 1 else 1,
+    )
+
+
 def clamp(low: float, high: float) -> Function:
     """``min(max(x, low), high)``; infinite is no limit; ``high`` where the lower limit is above it."""
     if low > high:
@@ -219,15 +332,19 @@ def clamp(low: float, high: float) -> Function:
     return Function(tuple(pieces))
 
 
-def function_of(kind: str, constants: Sequence[float]) -> Function:
+def function_of(kind: str, constants: Sequence[float]) -> Function | Staircase | Sawtooth:
     """The function of an instruction that has one operand and is not linear."""
+    if kind in JUMPS:
+        return JUMPS[kind]
     made = _WITH_NUMBERS.get(kind)
     return FUNCTIONS[kind] if made is None else made(*constants)
 
 
-_WITH_NUMBERS: dict[str, Callable[..., Function]] = {
+_WITH_NUMBERS: dict[str, Callable[..., Function | Sawtooth]] = {
     "leaky_relu": leaky_relu,
     "elu": elu,
     "softplus": softplus,
-    "pow": lambda exponent: integer_power(int(exponent)),
+    "pow": power,
+    "remainder": remainder,
+    "fmod": fmod,
 }

@@ -8,8 +8,10 @@ depends on no direction is computed once for all directions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-from sagemp_cli.checker.balls import arb, arb_mat, balls
+from sagemp_cli.checker.balls import arb, arb_mat, ball, balls
+from sagemp_cli.checker.functions import FUNCTIONS, function_of
 from sagemp_cli.checker.points import Point
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
 from sagemp_cli.checker.unproved import Unproved
@@ -110,8 +112,10 @@ def _result(i: Instruction, reads: Sequence[Column]) -> Column:
             return [_power(a, 2) for a in left]
         return [_PAIRS[kind](a, b) for a, b in zip(left, right, strict=True)]
     if kind == "pow":
-        exponent = int(i.constants[0])
-        return [_power(a, exponent) for a in reads[0]]
+        exponent = float(i.constants[0])
+        return [_real_power(a, exponent) if exponent % 1 else _power(a, int(exponent)) for a in reads[0]]
+    if kind in ("remainder", "fmod", "wrap"):
+        return [_left(function_of(kind, i.constants.tolist()), a) for a in reads[0]]
     return [_FUNCTIONS[kind](a) for a in reads[0]]
 
 
@@ -201,6 +205,25 @@ def _power(a: Interval, exponent: int) -> Interval:
     return ZERO, (-low).max(high) ** exponent
 
 
+def _real_power(a: Interval, exponent: float) -> Interval:
+    """``a^p`` for a p that is not whole."""
+    if not (a[0] > 0 or (exponent > 0 and a[0] >= 0)):
+        raise Unproved("a power that is not whole may be of less than 0")
+    ends = a[0] ** ball(exponent), a[1] ** ball(exponent)
+    return ends if exponent > 0 else (ends[1], ends[0])
+
+
+def _left(function: Any, a: Interval) -> Interval:
+    """What is left when whole periods are taken off; refused where it jumps: there it has no derivative."""
+    if not function.straight(*a):
+        raise Unproved("a remainder, or an angle, may jump by a whole period")
+    return function.excess(ZERO, *a)
+
+
+def _gelu_tanh(a: Interval) -> Interval:
+    return FUNCTIONS["gelu_tanh"].excess(ZERO, *a)
+
+
 def _met(a: Interval, first: arb, every: arb) -> bool:
     """Whether ``first`` or a whole number of ``every`` beside it may lie between the ends."""
     low, high = (a[0] - first) / every, (a[1] - first) / every
@@ -275,6 +298,7 @@ _FUNCTIONS: Mapping[str, Callable[[Interval], Interval]] = {
     "log": _log,
     "sqrt": _sqrt,
     "silu": _silu,
+    "gelu_tanh": _gelu_tanh,
     "exp": _rising(arb.exp),
     "atan": _rising(arb.atan),
     "tanh": _rising(arb.tanh),

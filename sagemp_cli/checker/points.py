@@ -8,6 +8,7 @@ import numpy as np
 
 from sagemp_cli.checker.balls import arb, balls
 from sagemp_cli.checker.functions import Function, clamp, function_of
+from sagemp_cli.checker.jumps import Sawtooth, Staircase
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
 
 Point = list[arb]
@@ -50,7 +51,7 @@ def value_of(instruction: Instruction, operands: Sequence[Point]) -> Point:
     return [f.value(a) for f, a in zip(functions_of(instruction, len(operands[0])), operands[0], strict=True)]
 
 
-def functions_of(instruction: Instruction, width: int) -> list[Function]:
+def functions_of(instruction: Instruction, width: int) -> list[Function | Staircase | Sawtooth]:
     """The function of each entry of an instruction that has one operand and is not linear."""
     constants = instruction.constants.tolist()
     if instruction.kind == "clamp":

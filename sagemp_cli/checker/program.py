@@ -16,8 +16,11 @@ import numpy as np
 
 INPUTS = ("state", "disturbance", "numbers")
 MOVES = ("pick", "join", "linear", "add", "sub", "neg")
-SCALARS = ("sin", "cos", "tan", "atan", "tanh", "sigmoid", "silu", "exp", "log", "sqrt", "abs", "reciprocal", "relu")
-WITH_NUMBERS: Mapping[str, int] = {"leaky_relu": 1, "elu": 1, "softplus": 2, "pow": 1}
+SCALARS = (
+    "sin", "cos", "tan", "atan", "tanh", "sigmoid", "silu", "gelu", "gelu_tanh", "mish", "softsign", "hardswish", "erf",
+    "exp", "log", "sqrt", "abs", "reciprocal", "relu", "floor", "ceil", "round", "trunc", "sign", "positive", "wrap",
+)  # fmt: skip
+WITH_NUMBERS: Mapping[str, int] = {"leaky_relu": 1, "elu": 1, "softplus": 2, "pow": 1, "remainder": 1, "fmod": 1}
 """Functions of one value that have constants, and how many."""
 PAIRS = ("add", "sub", "mul", "div", "maximum", "minimum", "atan2")
 UNARY = ("pick", "linear", "neg", "clamp", "identity", *SCALARS, *WITH_NUMBERS)
@@ -190,9 +193,11 @@ def _numbered(program: Program, ids: dict[tuple[Any, ...], int], given: Mapping[
 
 _ALLOWED: Mapping[str, tuple[Callable[[float], bool], str]] = {
     "leaky_relu": (lambda s: s <= 1, "a slope of at most 1"),
-    "elu": (lambda a: a == 1, "an alpha of 1"),
+    "elu": (lambda a: a > 0, "a positive alpha"),
     "softplus": (lambda b: b > 0, "a positive beta"),
-    "pow": (lambda p: p == int(p) and p not in (0, 1) and abs(p) < _LARGEST_POWER, "a whole exponent but 0 and 1"),
+    "pow": (lambda p: p not in (0, 1) and abs(p) < _LARGEST_POWER, "an exponent but 0 and 1 below 2^31 in size"),
+    "remainder": (lambda m: m > 0, "a positive period"),
+    "fmod": (lambda m: m > 0, "a positive period"),
 }
 
 

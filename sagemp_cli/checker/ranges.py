@@ -6,6 +6,7 @@ None stands for an interval of which nothing is known. Only what a function give
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from sagemp_cli.checker.balls import arb, ball
 from sagemp_cli.checker.functions import function_of
@@ -53,10 +54,15 @@ def _of_one(instruction: Instruction, i: int, a: Range) -> Range:
             return (ball(min(limits)), ball(limits[1])) if finite else None
         low, high = (_clamped(x, *limits) for x in a)
         return low, high
+    if a is None and kind in _BOUNDED:
+        low, high = _BOUNDED[kind]
+        return (ball(low) if isinstance(low, float) else low()), (ball(high) if isinstance(high, float) else high())
+    if a is None and kind in ("remainder", "fmod"):
+        return ball(0.0 if kind == "remainder" else -constants[0]), ball(constants[0])
     if a is None:
-        return (ball(_BOUNDED[kind][0]), ball(_BOUNDED[kind][1])) if kind in _BOUNDED else None
+        return None
     if kind == "pow":
-        return _power(a, int(constants[0]))
+        return _power(a, int(constants[0])) if constants[0] == int(constants[0]) else _real_power(a, constants[0])
     if kind in _OWN:
         return _OWN[kind](a)
     function = function_of(kind, constants)
@@ -111,6 +117,14 @@ def _power(a: tuple[arb, arb], exponent: int) -> Range:
     return (ends[1], ends[0]) if a[1] <= 0 else (_ZERO, ends[0].max(ends[1]))
 
 
+def _real_power(a: tuple[arb, arb], exponent: float) -> Range:
+    """Of a number that is not negative."""
+    if not (a[0] >= 0 if exponent > 0 else a[0] > 0):
+        return None
+    ends = a[0] ** ball(exponent), a[1] ** ball(exponent)
+    return ends if exponent > 0 else (ends[1], ends[0])
+
+
 def _size(a: tuple[arb, arb]) -> Range:
     if a[0] >= 0:
         return a
@@ -155,7 +169,11 @@ _OWN: dict[str, Callable[[tuple[arb, arb]], Range]] = {
     "reciprocal": _reciprocal,
 }
 
-_RISING = ("atan", "tanh", "sigmoid", "exp", "log", "sqrt", "elu", "softplus")
+_RISING = ("atan", "tanh", "sigmoid", "exp", "log", "sqrt", "elu", "softplus", "softsign", "erf")
 """Outside of their domain they give what is not finite."""
 
-_BOUNDED = {"sin": (-1.0, 1.0), "cos": (-1.0, 1.0), "tanh": (-1.0, 1.0), "sigmoid": (0.0, 1.0)}
+_BOUNDED: dict[str, tuple[Any, Any]] = {
+    **dict.fromkeys(("sin", "cos", "tanh", "erf", "softsign", "sign"), (-1.0, 1.0)),
+    **dict.fromkeys(("sigmoid", "positive"), (0.0, 1.0)),
+    "wrap": (lambda: -arb.pi(), arb.pi),
+}

@@ -17,9 +17,12 @@ Value = int | None
 Series = list[Value]
 
 SMOOTH = (
-    "sin", "cos", "tan", "atan", "tanh", "sigmoid", "silu", "exp", "log", "sqrt", "reciprocal", "pow",
+    "sin", "cos", "tan", "atan", "tanh", "sigmoid", "silu", "gelu_tanh", "exp", "log", "sqrt", "reciprocal", "pow",
+    "remainder", "fmod", "wrap",
 )  # fmt: skip
-"""Functions of one value that have all derivatives wherever they are defined."""
+"""Functions of one value that have all derivatives wherever they are defined and do not jump."""
+_GELU = 2 * 0.7978845608028654, 0.044715
+"""The factors of ``p = 2 c (a + d a^3)`` in ``gelu_tanh a = a sigmoid(p)``."""
 _EACH = ("pick", "join", "linear", "neg", "add", "sub", "identity")
 RATES = ("state", "numbers", "constant", "mul", "div", "atan2", *_EACH, *SMOOTH)
 """What a right-hand side may be made of; what it may not has a kink, or is the disturbance."""
@@ -75,6 +78,10 @@ class Expansion:
             return self._power(slot, i, read[0], q)
         if kind in _SQUARED:
             return self._with_square(slot, kind, read[0], q)
+        if kind in ("remainder", "fmod", "wrap"):
+            return read[0][q] if q else self.out.copy(i, [_sure(read[0][0])])
+        if kind == "gelu_tanh":
+            return self._gelu(slot, read[0], q)
         if kind in ("silu", "atan"):
             return (self._silu if kind == "silu" else self._arctangent)(slot, read[0], q)
         if q == 0:
@@ -224,6 +231,15 @@ class Expansion:
         slope.append(self._sum("sub", s[q], self._squares(s, q)))
         return self.out.put("silu", _sure(a[0])) if q == 0 else self._products(a, s, q, 0, q)
 
+    def _gelu(self, slot: int, a: Series, q: int) -> Value:
+        square, inner, s, slope = (self._beside(slot, name) for name in ("square", "inner", "sigmoid", "slope"))
+        square.append(self._squares(a, q))
+        cube = self._scaled(self._products(square, a, q, 0, q), _GELU[1])
+        inner.append(self._scaled(self._sum("add", a[q], cube), _GELU[0]))
+        s.append(self.out.put("sigmoid", _sure(inner[0])) if q == 0 else self._chain(inner, slope, q))
+        slope.append(self._sum("sub", s[q], self._squares(s, q)))
+        return self.out.put("gelu_tanh", _sure(a[0])) if q == 0 else self._products(a, s, q, 0, q)
+
     def _arctangent(self, slot: int, a: Series, q: int) -> Value:
         under, slope = self._beside(slot, "under"), self._beside(slot, "slope")
         under.append(self._one(self._squares(a, q), q, "add"))
@@ -234,7 +250,21 @@ class Expansion:
         slope.append(self._inverse(under, slope, q))
         return own
 
+    def _real_power(self, i: Instruction, a: Series, own: Series, q: int) -> Value:
+        if q == 0:
+            return self.out.copy(i, [_sure(a[0])])
+        over: Value = None
+        under: Value = None
+        for j in range(1, q + 1):
+            over = self._sum("add", over, self._scaled(self._times(a[j], own[q - j]), j))
+        for j in range(1, q):
+            under = self._sum("add", under, self._scaled(self._times(own[j], a[q - j]), j))
+        rest = self._sum("sub", self._scaled(over, float(i.constants[0])), under)
+        return self._quotient_by(self._over(rest, q), a[0])
+
     def _power(self, slot: int, i: Instruction, a: Series, q: int) -> Value:
+        if i.constants[0] % 1:
+            return self._real_power(i, a, self._of[slot], q)
         exponent = int(i.constants[0])
         power = a
         for place, digit in enumerate(f"{abs(exponent):b}"[1:]):

@@ -25,6 +25,11 @@ OF_ONE: dict[str, Callable] = {
     "neg": torch.neg, "sin": torch.sin, "cos": torch.cos, "tan": torch.tan, "atan": torch.atan, "tanh": torch.tanh,
     "sigmoid": torch.sigmoid, "silu": torch.nn.functional.silu, "exp": torch.exp, "log": torch.log, "sqrt": torch.sqrt,
     "abs": torch.abs, "reciprocal": torch.reciprocal, "relu": torch.relu, "identity": lambda a: a,
+    "gelu": torch.nn.functional.gelu, "gelu_tanh": lambda a: torch.nn.functional.gelu(a, approximate="tanh"),
+    "mish": torch.nn.functional.mish, "softsign": torch.nn.functional.softsign, "erf": torch.erf,
+    "hardswish": torch.nn.functional.hardswish, "floor": torch.floor, "ceil": torch.ceil, "round": torch.round,
+    "trunc": torch.trunc, "sign": torch.sign, "positive": lambda a: (a > 0).double(),
+    "wrap": lambda a: torch.atan2(a.sin(), a.cos()),
 }  # fmt: skip
 OF_TWO: dict[str, Callable] = {
     "add": torch.add, "sub": torch.sub, "mul": torch.mul, "div": torch.div, "maximum": torch.maximum,
@@ -61,8 +66,8 @@ def run(made: Program, x: np.ndarray, w: np.ndarray, numbers: np.ndarray | None 
             value = torch.minimum(
                 torch.maximum(read[0], constants[: len(constants) // 2]), constants[len(constants) // 2 :]
             )
-        elif kind == "pow":
-            value = read[0] ** int(numbers_of[0])
+        elif kind in ("pow", "remainder", "fmod"):
+            value = {"pow": torch.pow, "remainder": torch.remainder, "fmod": torch.fmod}[kind](read[0], numbers_of[0])
         elif kind == "leaky_relu":
             value = torch.nn.functional.leaky_relu(read[0], numbers_of[0])
         elif kind == "elu":

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagemp_cli.checker.balls import Unproved
-from sagemp_cli.checker.functions import FUNCTIONS, Smooth, clamp, elu, integer_power, leaky_relu, softplus
+from sagemp_cli.checker.functions import FUNCTIONS, Smooth, clamp, elu, integer_power, leaky_relu, power, softplus
+from sagemp_cli.checker.jumps import JUMPS, fmod, remainder
 
 NAMED = {
     **FUNCTIONS,
@@ -15,12 +16,18 @@ NAMED = {
     "clamp": clamp(-0.5, 1.5),
     "clamp from below": clamp(0.25, math.inf),
     "elu": elu(1.0),
+    "elu with a small alpha": elu(0.3),
+    "elu with a large alpha": elu(2.5),
+    "power 1.5": power(1.5),
+    "power 0.3": power(0.3),
+    "power -0.7": power(-0.7),
     "softplus": softplus(2.0, 20.0),
     "square": integer_power(2),
     "cube": integer_power(3),
     "inverse square": integer_power(-2),
 }
-POSITIVE = ("log", "sqrt", "reciprocal", "inverse square")
+JUMPING = {**JUMPS, "remainder": remainder(0.7), "fmod": fmod(0.7)}
+POSITIVE = ("log", "sqrt", "reciprocal", "inverse square", "power 1.5", "power 0.3", "power -0.7")
 
 
 @pytest.fixture(autouse=True)
@@ -99,3 +106,37 @@ def test_a_root_is_bounded_from_0_on(slope):
     x = np.linspace(0, 2, 100_001)
     values = np.sqrt(x) - slope * x
     assert float(least) <= values.min() + 1e-12 and values.max() <= float(most) <= values.max() + 1e-3
+
+
+@pytest.mark.parametrize("name", JUMPING)
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    st.sampled_from([0.0, 0.5, 1.0, -1.5, 2.25, 0.7, -0.7, 3.0]), st.floats(-12, 3), st.floats(-2, 2), st.integers(0, 2)
+)
+def test_no_point_of_a_function_that_jumps_lies_outside_and_the_hull_is_met(name, end, size, slope, side):
+    function, width = JUMPING[name], math.exp(size)
+    with ctx.workprec(128):
+        low, high, s = arb(end - width * (side != 0)), arb(end + width * (side != 1)), arb(slope)
+        least, most = function.excess(s, low, high)
+        flat = function.excess(arb(0), low, high)
+        values = []
+        for x in [float(low), float(high), *np.linspace(float(low), float(high), 101), end]:
+            x = arb(float(x)).max(low).min(high)
+            y = function.value(x)
+            assert not (y - s * x < least) and not (y - s * x > most)
+            values.append(float(y.mid()))
+        if name not in ("remainder", "fmod", "wrap"):  # of these the hull is of whole periods
+            assert float(flat[0]) == min(values) and float(flat[1]) == max(values)
+
+
+@pytest.mark.parametrize("name", JUMPING)
+def test_where_nothing_jumps_a_function_is_a_line(name):
+    """A slope of its own leaves a number."""
+    slope = arb(1.0 if name in ("remainder", "fmod", "wrap") else 0.0)
+    least, most = JUMPING[name].excess(slope, arb(7.1), arb(7.3))
+    assert float(most - least) < 1e-30
+
+
+def test_half_is_rounded_to_the_even_number():
+    for x, rounded in ((0.5, 0), (1.5, 2), (2.5, 2), (-0.5, 0), (-1.5, -2)):
+        assert JUMPS["round"].value(arb(x)) == rounded

@@ -12,10 +12,10 @@ from .by_hand import line, program, run
 ONE = {
     "neg": (-3, 3), "sin": (-9, 9), "cos": (-9, 9), "tan": (-1.5, 1.5), "atan": (-4, 4), "tanh": (-4, 4),
     "sigmoid": (-6, 6), "silu": (-5, 3), "exp": (-3, 3), "log": (0.1, 4), "sqrt": (0, 4), "reciprocal": (0.2, 3),
-    "identity": (-1, 1),
+    "identity": (-1, 1), "wrap": (-3, 3), "gelu_tanh": (-3, 3),
 }  # fmt: skip
 TWO = {"add": (-2, 2), "sub": (-2, 2), "mul": (-2, 2), "div": (0.3, 2), "atan2": (0.1, 2)}
-POWERS = [2, 3, 4, 5, -1, -2, -3]
+POWERS = [2, 3, 4, 5, -1, -2, -3, 1.5, 0.3, -0.7]
 
 
 def bounds(made, lower, upper):
@@ -64,7 +64,8 @@ def test_a_function_of_one_value_is_bounded_as_near_as_can_be(kind):
 
 @pytest.mark.parametrize("exponent", POWERS)
 def test_a_power_is_bounded_as_near_as_can_be(exponent):
-    for low, high in ((-2, -0.2), (0.2, 2), *([(-2, 2)] if exponent > 0 else [])):
+    whole = exponent % 1 == 0
+    for low, high in ((0.2, 2), *([(-2, -0.2)] if whole else []), *([(-2 * whole, 2)] if exponent > 0 else [])):
         for ends in boxes(low, high, 1, 30):
             require_close(of_one("pow", constants=[exponent]), ends, 1, exact=True)
 

@@ -23,6 +23,7 @@ from torch import Tensor
 from sagemp_cli.reachability.continuous.expansion import Expansion
 from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
+from sagemp_cli.reachability.relaxations.sawtooth import within_a_period
 from sagemp_cli.sets import Box, round_down, round_up
 from sagemp_cli.sets.rounding import TINY
 
@@ -74,8 +75,8 @@ def run_smoothly(
 ) -> tuple[Outputs, Tensor]:
     """What a program gives over boxes ``(..., n)``, and over which of them it is smooth, ``(...)``.
 
-    An angle may jump where its values are bounded all the same, and whatever is made of it then may be bounded too:
-    so it is the operation that tells, and not the result.
+    An angle or a remainder may jump where its values are bounded all the same, and whatever is made of it then may be
+    bounded too: so it is the operation that tells, and not the result.
     """
     smooth = torch.ones(state.lower.shape[:-1], dtype=torch.bool)
 
@@ -84,6 +85,8 @@ def run_smoothly(
         if i.kind == "atan2":
             y, x = operands
             smooth = smooth & ((x.lower > 0) | (y.lower > 0) | (y.upper < 0)).all(-1)
+        elif i.kind in ("remainder", "fmod", "wrap"):
+            smooth = smooth & within_a_period(i.kind, *operands[0].bounds, *map(float, i.constants)).all(-1)
         return evaluate(i, operands)
 
     return program.run(state, w, numbers, evaluate=noted), smooth

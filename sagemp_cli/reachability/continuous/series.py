@@ -13,13 +13,18 @@ import torch
 
 from sagemp_cli.errors import UnsupportedOperationError
 from sagemp_cli.reachability.continuous.writing import Writer
+from sagemp_cli.reachability.program.kinds import INPUTS
 from sagemp_cli.reachability.program.program import Instruction, Program
+from sagemp_cli.reachability.relaxations.gelu import CUBIC, SCALE
 
 Coefficients = list[int | None]
 """Slots, of order 0, 1, 2, ..."""
 
 LINEAR = ("pick", "join", "linear", "neg", "add", "sub", "identity")
-UNSMOOTH = ("relu", "leaky_relu", "abs", "clamp", "elu", "softplus", "maximum", "minimum")
+UNSMOOTH = (
+    "relu", "leaky_relu", "abs", "clamp", "elu", "softplus", "softsign", "hardswish", "maximum", "minimum", "floor",
+    "ceil", "round", "trunc", "sign", "positive",
+)  # fmt: skip
 
 
 class Series:
@@ -44,6 +49,11 @@ class Series:
                 raise UnsupportedOperationError(
                     f"'{i.kind}' stands in the right-hand side of the ODE, which must be smooth for a proof in "
                     f"continuous time; smooth ones are tanh, sigmoid, silu, sin, ..."
+                )
+            if i.kind not in (*INPUTS, "constant", *LINEAR, "mul", "div", "atan2", *RULES):
+                raise UnsupportedOperationError(
+                    f"'{i.kind}' stands in the right-hand side of the ODE, and no derivatives in time are written for "
+                    f"it; they are for {', '.join(RULES)}"
                 )
         self._out, self._program, self._state = out, program, state
         self._numbers = numbers
@@ -256,8 +266,41 @@ class Series:
         slope.append(None if rest is None else self._out.of("neg", rest))
         return found
 
+    def _gelu_tanh(self, slot: int, i: Instruction, q: int) -> int | None:
+        """``a sigmoid(p)`` with ``p = 2 c (a + d a^3)``."""
+        a, square, p, s, slope = (
+            self._values[i.operands[0]],
+            *(self.series_beside(name, slot) for name in ("square", "inner", "sigmoid", "slope")),
+        )
+        square.append(self._cauchy(a, a, q))
+        cube = self._scaled(self._cauchy(square, a, q), CUBIC)
+        p.append(self._scaled(self._sum(a[q], cube), 2 * SCALE))
+        s.append(self._out.of("sigmoid", _there(p[0])) if q == 0 else self._integrated(p, slope, q))
+        slope.append(self._sum(s[q], self._cauchy(s, s, q), "sub"))
+        return self._out.made(i, [_there(a[0])]) if q == 0 else self._cauchy(a, s, q)
+
+    def _within_a_period(self, slot: int, i: Instruction, q: int) -> int | None:
+        """What is left of a value has the value's derivatives, as long as nothing jumps."""
+        a = self._values[i.operands[0]]
+        return a[q] if q else self._out.made(i, [_there(a[0])])
+
+    def _real_power(self, slot: int, i: Instruction, q: int) -> int | None:
+        """``a c' = p c a'``."""
+        a, found, p = self._values[i.operands[0]], self._values[slot], float(i.constants[0])
+        if q == 0:
+            return self._out.made(i, [_there(a[0])])
+        over = under = None
+        for j in range(1, q + 1):
+            over = self._sum(over, self._scaled(self._times(a[j], found[q - j]), j))
+        for j in range(1, q):
+            under = self._sum(under, self._scaled(self._times(found[j], a[q - j]), j))
+        total = self._divided(self._sum(self._scaled(over, p), under, "sub"), q)
+        return None if total is None else self._out.of("div", total, _there(a[0]))
+
     def _pow(self, slot: int, i: Instruction, q: int) -> int | None:
         """A power as products: binary, from the highest digit; of a negative exponent, the reciprocal of one."""
+        if float(i.constants[0]) % 1:
+            return self._real_power(slot, i, q)
         a, exponent = self._values[i.operands[0]], int(i.constants[0])
         power: Coefficients = a
         for place, digit in enumerate(bin(abs(exponent))[3:]):
@@ -298,9 +341,15 @@ def _there(slot: int | None) -> int:
 
 
 RULES: dict[str, Callable[[Series, int, Instruction, int], int | None]] = {
-    name: getattr(Series, f"_{name}")
-    for name in ("sin", "cos", "exp", "log", "sqrt", "reciprocal", "tanh", "tan", "sigmoid", "silu", "atan", "pow")
-}
+    **{
+        name: getattr(Series, f"_{name}")
+        for name in (
+            "sin", "cos", "exp", "log", "sqrt", "reciprocal", "tanh", "tan", "sigmoid", "silu", "gelu_tanh", "atan",
+            "pow",
+        )
+    },
+    **dict.fromkeys(("remainder", "fmod", "wrap"), Series._within_a_period),
+}  # fmt: skip
 
 
 def state_coefficients(

@@ -1,5 +1,6 @@
 """Records what one step of a stranger's loop does, as a program that every propagator can run."""
 
+import sagemp_cli.reachability.program.activations
 import sagemp_cli.reachability.program.arithmetic
 import sagemp_cli.reachability.program.conversions
 import sagemp_cli.reachability.program.entries

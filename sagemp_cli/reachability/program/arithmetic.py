@@ -148,7 +148,7 @@ def square(x: Traced) -> Traced:
 
 @answers("pow", "__pow__", "float_power")
 def power(a: Any, exponent: Any) -> Traced:
-    """Powers with a number as exponent; those that are not whole, of positive values."""
+    """Powers with a number as exponent; those that are not whole, of values that are not negative."""
     if type(exponent) is not Traced and is_tensor(exponent) and math.prod(exponent.shape) == 1:
         exponent = exponent.item()
     if not isinstance(a, Traced) or type(exponent) not in (int, float):
@@ -157,10 +157,6 @@ def power(a: Any, exponent: Any) -> Traced:
         return elementwise("sqrt", a)
     if not math.isfinite(exponent):
         raise UnsupportedOperationError(f"torch operation 'pow' is supported with a finite exponent, found {exponent}")
-    if exponent % 1 == 0.5:
-        return multiply(power(a, math.floor(exponent)), elementwise("sqrt", a))
-    if exponent % 1:
-        return elementwise("exp", multiply(elementwise("log", a), exponent))
     if exponent == 1:
         return a._like(a.ids.clone())
     if exponent == 0:
@@ -172,9 +168,8 @@ def power(a: Any, exponent: Any) -> Traced:
 def leaky_relu(x: Traced, negative_slope: float = 0.01, inplace: bool = False) -> Traced:
     """Leaky ReLU."""
     if not negative_slope <= 1:
-        raise UnsupportedOperationError(
-            f"leaky_relu is supported with a negative_slope of at most 1, found {negative_slope}"
-        )
+        above = elementwise("relu", x)
+        return add(above, multiply(subtract(x, above), negative_slope))
     return elementwise("leaky_relu", x, numbers=(negative_slope,))
 
 
@@ -184,14 +179,6 @@ def softplus(x: Traced, beta: float = 1.0, threshold: float = 20.0) -> Traced:
     if not beta > 0:
         raise UnsupportedOperationError(f"softplus is supported with a positive beta, found {beta}")
     return elementwise("softplus", x, numbers=(beta, threshold))
-
-
-@answers("elu")
-def elu(x: Traced, alpha: float = 1.0, inplace: bool = False) -> Traced:
-    """ELU."""
-    if alpha != 1:
-        raise UnsupportedOperationError(f"elu is supported with alpha 1, found {alpha}")
-    return elementwise("elu", x, numbers=(alpha,))
 
 
 @answers("clamp", "clip")
@@ -246,7 +233,11 @@ def minimum(a: Any, b: Any) -> Traced:
 
 @answers("atan2", "arctan2")
 def arctangent2(y: Any, x: Any) -> Traced:
-    """Angle of the point (x, y)."""
+    """Angle of the point (x, y); of sine and cosine of one value that value, less whole turns."""
+    if isinstance(y, Traced) and isinstance(x, Traced) and y.shape == x.shape:
+        ids = x.recorder.angle_of(y.ids, x.ids)
+        if ids is not None:
+            return elementwise("wrap", x._like(ids), name="atan2")
     return elementwise("atan2", y, x)
 
 

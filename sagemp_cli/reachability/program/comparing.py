@@ -116,14 +116,17 @@ def corners_and_centres(cells: Box, disturbance: Box, *, most: int) -> tuple[Ten
 
 def _gaps(i: Instruction, values: Sequence[Tensor]) -> list[Tensor]:
     """How far values are from where an instruction has its kinks."""
-    if i.kind in ("relu", "leaky_relu", "abs", "elu"):
+    if i.kind in ("relu", "leaky_relu", "abs", "elu", "sign", "positive", "softsign"):
         return [values[0]]
+    if i.kind == "hardswish":
+        return [values[0] - 3.0, values[0] + 3.0]
     if i.kind in ("maximum", "minimum"):
         return [values[0] - values[1]]
     limits = i.constants if i.kind == "clamp" else ()
     return [values[0][..., finite] - limit[finite] for limit in limits if (finite := torch.isfinite(limit)).any()]
 
 
+@torch.enable_grad()  # whoever calls may have switched it off
 def near_kinks(program: Program, numbers: Tensor, start: Box, disturbance: Box) -> tuple[Tensor, Tensor]:
     """Points ``(B, n)``, ``(B, d)`` of the boxes at and beside the thresholds of the program's clamps, relus and so on.
 
@@ -139,9 +142,8 @@ def near_kinks(program: Program, numbers: Tensor, start: Box, disturbance: Box) 
             found.extend(gap for gap in _gaps(i, values) if gap.requires_grad)
             return i.on(*values)
 
-        with torch.enable_grad():
-            x, w = z.split(sizes, dim=-1)
-            program.run(x, w, numbers, evaluate=noted)
+        x, w = z.split(sizes, dim=-1)
+        program.run(x, w, numbers, evaluate=noted)
         return torch.cat(found, -1) if found else None
 
     z = both.sample(_STARTS, torch.Generator().manual_seed(3)).requires_grad_(True)

@@ -49,7 +49,7 @@ _TYPES = {
 _CHOICES = """
     all allclose any bucketize count_nonzero eq equal ge greater greater_equal gt heaviside isclose isfinite isinf isnan
     le less less_equal logical_and logical_not logical_or logical_xor lt masked_select ne nonzero not_equal searchsorted
-    sgn sign signbit unique where
+    signbit unique where
 """
 _PLACES = "argmax argmin argsort argwhere cummax cummin kthvalue median mode msort nanmedian quantile sort topk"
 _NUMBERS = "__bool__ __float__ __index__ __int__ item numpy tolist"

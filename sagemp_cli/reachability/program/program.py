@@ -238,10 +238,12 @@ def _complaint_of_constants(i: Instruction, sizes: Sequence[int]) -> str | None:
     numbers = [float(c) for c in i.constants if not c.dim()]
     if i.kind == "leaky_relu" and numbers[0] > 1:
         return f"has slope {numbers[0]}, allowed is at most 1"
-    if i.kind == "elu" and numbers[0] != 1:
-        return f"has alpha {numbers[0]}, allowed is 1"
+    if i.kind == "elu" and not numbers[0] > 0:
+        return f"has alpha {numbers[0]}, allowed is a positive one"
+    if i.kind in ("remainder", "fmod") and not numbers[0] > 0:
+        return f"has period {numbers[0]}, allowed is a positive one"
     if i.kind == "softplus" and not numbers[0] > 0:
         return f"has beta {numbers[0]}, allowed is a positive one"
-    if i.kind == "pow" and (numbers[0] != int(numbers[0]) or abs(numbers[0]) >= 2**31 or numbers[0] in (0, 1)):
-        return f"has exponent {numbers[0]}, allowed are whole numbers other than 0 and 1"
+    if i.kind == "pow" and (abs(numbers[0]) >= 2**31 or numbers[0] in (0, 1)):
+        return f"has exponent {numbers[0]}, allowed are those below 2^31 in size other than 0 and 1"
     return None

@@ -109,6 +109,21 @@ class Recorder:
         slots = tuple(o.index if isinstance(o, Slot) else self._constant_slot(o) for o in operands)
         return self._new(Instruction(kind, size, slots, tuple(constants)))
 
+    def angle_of(self, sines: Tensor, cosines: Tensor) -> Tensor | None:
+        """Ids of the values whose sines and cosines have these ids, of the same shape; None if they are no such."""
+        found: list[int] = []
+        for pair in zip(sines.reshape(-1).tolist(), cosines.reshape(-1).tolist(), strict=True):
+            of = []
+            for kind, id_ in zip(("sin", "cos"), pair, strict=True):
+                owner = int(self._owner[id_])
+                if id_ < 0 or self._instructions[owner].kind != kind:
+                    return None
+                of.append(self._starts[self._instructions[owner].operands[0]] + id_ - self._starts[owner])
+            if of[0] != of[1]:
+                return None
+            found.append(of[0])
+        return torch.tensor(found, dtype=torch.int64).reshape(sines.shape) if found else None
+
     def size_of(self, slot: Slot) -> int:
         """Entries of an instruction's result."""
         return self._instructions[slot.index].size

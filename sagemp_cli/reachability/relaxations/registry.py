@@ -14,17 +14,24 @@ from sagemp_cli.reachability.relaxations import arctangent as _arctangent
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations import clamp as _clamp
 from sagemp_cli.reachability.relaxations import elu as _elu
+from sagemp_cli.reachability.relaxations import error_function as _error_function
 from sagemp_cli.reachability.relaxations import exponential as _exponential
+from sagemp_cli.reachability.relaxations import gelu as _gelu
+from sagemp_cli.reachability.relaxations import hardswish as _hardswish
 from sagemp_cli.reachability.relaxations import identity as _identity
 from sagemp_cli.reachability.relaxations import leaky_relu as _leaky_relu
 from sagemp_cli.reachability.relaxations import logarithm as _logarithm
+from sagemp_cli.reachability.relaxations import mish as _mish
 from sagemp_cli.reachability.relaxations import power as _power
 from sagemp_cli.reachability.relaxations import reciprocal as _reciprocal
+from sagemp_cli.reachability.relaxations import sawtooth as _sawtooth
 from sagemp_cli.reachability.relaxations import sigmoid as _sigmoid
 from sagemp_cli.reachability.relaxations import silu as _silu
 from sagemp_cli.reachability.relaxations import sine as _sine
 from sagemp_cli.reachability.relaxations import softplus as _softplus
+from sagemp_cli.reachability.relaxations import softsign as _softsign
 from sagemp_cli.reachability.relaxations import square_root as _square_root
+from sagemp_cli.reachability.relaxations import staircase as _staircase
 from sagemp_cli.reachability.relaxations import tangent as _tangent
 from sagemp_cli.reachability.relaxations import tanh as _tanh
 from sagemp_cli.reachability.relaxations.band import Band
@@ -68,6 +75,10 @@ def _of(module: ModuleType, *, arrays: bool = False, ranges: bool = False) -> Op
     return Operation(module.band, module.lines, module.value_range, arrays, ranges)
 
 
+def _steps(steps: _staircase.Staircase) -> Operation:
+    return Operation(steps.band, steps.lines, steps.value_range)
+
+
 OPERATIONS: dict[str, Operation] = {
     "sin": Operation(_sine.sine_band, _sine.sine_lines, _sine.sine_range, arrays=True, ranges=True),
     "cos": Operation(_sine.cosine_band, _sine.cosine_lines, _sine.cosine_range, arrays=True, ranges=True),
@@ -76,6 +87,12 @@ OPERATIONS: dict[str, Operation] = {
     "tanh": _of(_tanh),
     "sigmoid": _of(_sigmoid),
     "silu": _of(_silu),
+    "gelu": _of(_gelu),
+    "gelu_tanh": Operation(_gelu.tanh_band, _gelu.tanh_lines, _gelu.tanh_value_range),
+    "mish": _of(_mish),
+    "softsign": _of(_softsign),
+    "hardswish": _of(_hardswish),
+    "erf": _of(_error_function),
     "exp": _of(_exponential),
     "log": _of(_logarithm),
     "sqrt": _of(_square_root),
@@ -87,6 +104,15 @@ OPERATIONS: dict[str, Operation] = {
     "softplus": _of(_softplus),
     "pow": _of(_power),
     "clamp": _of(_clamp, ranges=True),
+    "floor": _steps(_staircase.FLOOR),
+    "ceil": _steps(_staircase.CEIL),
+    "round": _steps(_staircase.ROUND),
+    "trunc": _steps(_staircase.TRUNC),
+    "sign": _steps(_staircase.SIGN),
+    "positive": _steps(_staircase.POSITIVE),
+    "remainder": Operation(_sawtooth.remainder_band, _sawtooth.remainder_lines, _sawtooth.remainder_range),
+    "fmod": Operation(_sawtooth.fmod_band, _sawtooth.fmod_lines, _sawtooth.fmod_range),
+    "wrap": Operation(_sawtooth.wrap_band, _sawtooth.wrap_lines, _sawtooth.wrap_range),
     "identity": _of(_identity, arrays=True, ranges=True),
     "atan2": _of(_arctangent2),
 }
@@ -113,9 +139,9 @@ def relaxation(kind: str, constants: tuple[Tensor, ...] = ()) -> Relaxation:
     if kind == "relu":
         return Relaxation(kind, operation, (0.0,))
     if kind == "pow":
-        return Relaxation(f"pow({int(constants[0])})", operation, (int(constants[0]),))
-    if kind == "elu":  # only alpha 1 is a program
-        return Relaxation(kind, operation)
+        exponent = float(constants[0])
+        whole = int(exponent) if exponent == int(exponent) else exponent
+        return Relaxation(f"pow({whole})", operation, (whole,))
     if kind == "clamp" and not all(bool((limit == limit[0]).all()) for limit in constants):
         return Relaxation(kind, operation, constants)
     return Relaxation(kind, operation, tuple(float(c.reshape(-1)[0]) for c in constants))

@@ -11,7 +11,8 @@ from sagemp_cli.reachability.relaxations import pieces
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import Lines
 from sagemp_cli.reachability.relaxations.pieces import Curve, Piece
-from sagemp_cli.reachability.relaxations.value_range import outward
+from sagemp_cli.reachability.relaxations.touching import by_regula_falsi
+from sagemp_cli.reachability.relaxations.value_range import dipped
 
 ULPS = 4
 """Margin for the formulas below, in ulps of the result; tested against ball arithmetic."""
@@ -38,27 +39,7 @@ def _derivative(x: Tensor) -> Tensor:
     return (torch.where(x >= 0, torch.ones_like(q), q) + x * (q / d)) / d
 
 
-def _solve(slope: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """Where the derivative, monotone on the piece, is nearest to the slope: regula falsi, Illinois variant."""
-    left, right = start, end
-    at_left, at_right = _derivative(left) - slope, _derivative(right) - slope
-    beyond, nearest = at_left * at_right > 0, torch.where(at_left.abs() < at_right.abs(), left, right)
-    t, near, before = left, 1e-6 * (at_right - at_left).abs(), torch.zeros_like(left, dtype=torch.bool)
-    for i in range(10):
-        drop = at_right - at_left
-        t = torch.where(drop == 0, left, right - at_right * (right - left) / drop)
-        t = torch.minimum(torch.fmax(t, left), right)
-        at = _derivative(t) - slope
-        if bool((beyond | (at.abs() <= near)).all()):
-            break
-        # The end that stays for the second time counts half.
-        same = (at > 0) == (at_right > 0)
-        stays = torch.where(same == before, 0.5, 1.0) if i else 1.0
-        left, at_left = torch.where(same, left, t), torch.where(same, at_left * stays, at)
-        right, at_right = torch.where(same, t, right), torch.where(same, at, at_right * stays)
-        before = same
-    return torch.where(beyond, nearest, t)
-
+_solve = by_regula_falsi(_derivative)
 
 CURVE = Curve(
     _value,
@@ -85,6 +66,4 @@ def lines(lower: Tensor, upper: Tensor) -> Lines:
 
 def value_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of SiLU on ``[lower, upper]``."""
-    first, last = _value(lower), _value(upper)
-    inside = _value(torch.minimum(lower.clamp(min=LOWEST), upper))
-    return outward(torch.minimum(torch.minimum(first, last), inside), torch.maximum(first, last), ulps=ULPS)
+    return dipped(_value, LOWEST, lower, upper, ulps=ULPS)

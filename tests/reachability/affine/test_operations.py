@@ -245,9 +245,9 @@ def test_atan2_across_its_jump_is_the_whole_circle():
 @pytest.mark.parametrize(
     ("name", "call"),
     [
-        ("floor", torch.floor),
-        ("cosh", torch.cosh),
-        ("erf", lambda x: x.erf()),
+        ("lgamma", torch.lgamma),
+        ("acos", torch.acos),
+        ("erfinv", lambda x: x.erfinv()),
     ],
 )
 def test_an_unsupported_operation_is_named_with_the_place_to_add_it(name, call):
@@ -267,8 +267,11 @@ def test_an_unsupported_operation_is_named_with_the_place_to_add_it(name, call):
         (lambda x: bool(x[0]), "a step may not branch on a value"),
         (lambda x: x ** float("inf"), "torch operation 'pow' is supported with a finite exponent, found inf"),
         (lambda x: 2**x, "torch operation 'pow' is supported with a number as exponent"),
-        (lambda x: functional.leaky_relu(x, 2.0), "negative_slope of at most 1, found 2.0"),
-        (lambda x: functional.elu(x, alpha=0.5), "elu is supported with alpha 1, found 0.5"),
+        (lambda x: functional.elu(x, alpha=-0.5), "elu is supported with an alpha of at least 0, found -0.5"),
+        (lambda x: functional.rrelu(x, training=True), "rrelu is random in training mode"),
+        (lambda x: x % 0.0, "'remainder' is supported with one number other than 0 as divisor, found 0.0"),
+        (lambda x: 2.0 % x, "'remainder' is supported with a number as divisor"),
+        (lambda x: torch.round(x, decimals=2), "'round(decimals=2)' has no relaxation"),
         (lambda x: functional.softplus(x, beta=-1.0), "softplus is supported with a positive beta, found -1.0"),
     ],
 )

@@ -19,6 +19,10 @@ RATES = {
     "atan": lambda x: torch.stack([torch.atan(x[1]), torch.atan(x[0] * 2)]),
     "atan2": lambda x: torch.stack([torch.atan2(x[0], 1 + x[1]), -x[0]]),
     "powers": lambda x: torch.stack([x[1] ** 3 - x[0] ** 5, x[0] ** 2]),
+    "powers that are not whole": lambda x: torch.stack([(x[0] + 1.5) ** 1.5, (x[1] + 2) ** -0.7]),
+    "gelu in its tanh form": lambda x: torch.nn.functional.gelu(x * 1.5, approximate="tanh"),
+    "what is left of periods": lambda x: torch.stack([torch.remainder(x[1] + 5, 2.0), torch.fmod(x[0] * x[1], 3.0)]),
+    "a wrapped angle": lambda x: torch.stack([torch.atan2(torch.sin(x[1]), torch.cos(x[1])), x[0]]),
     "negative powers": lambda x: torch.stack([(x[0] + 1.5) ** -2, (x[1] + 2) ** -3]),
     "constant": lambda x: torch.stack([x[1], torch.tensor(-9.81, dtype=torch.float64) + 0 * x[0]]),
     "one entry with all": lambda x: x * x[:1] - x[1:] + 1,
@@ -50,6 +54,15 @@ def test_coefficients_are_the_derivatives_of_the_flow(name):
         expected.append(g(x0).detach() / factorial)
         g = derivative(g)
     torch.testing.assert_close(values, torch.stack(expected), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gelu", "erf", "mish"])
+def test_a_rate_without_written_derivatives_is_refused_by_name(name):
+    function = getattr(torch, name, None) or getattr(torch.nn.functional, name)
+    x0 = torch.tensor([0.3, 0.4], dtype=torch.float64)
+    program, out = record(lambda x, w: function(x), x0, torch.zeros(2, dtype=torch.float64)), Writer(2, 2)
+    with pytest.raises(UnsupportedOperationError, match=f"'{name}' stands in .* no derivatives in time"):
+        state_coefficients(out, program, out.state, None, None, 1)
 
 
 @pytest.mark.parametrize("kink", [torch.relu, torch.abs, lambda x: x.clamp(-1, 1)])

@@ -15,16 +15,23 @@ from sagemp_cli.reachability.relaxations import (
     arctangent,
     clamp,
     elu,
+    error_function,
     exponential,
+    gelu,
+    hardswish,
     leaky_relu,
     logarithm,
+    mish,
     power,
     reciprocal,
+    sawtooth,
     sigmoid,
     silu,
     sine,
     softplus,
+    softsign,
     square_root,
+    staircase,
     tangent,
     tanh,
 )
@@ -81,6 +88,70 @@ class flint_precision:  # noqa: N801
 
     def __exit__(self, *_):
         flint.ctx.prec = self.before
+
+
+def _real_power_case(n: float) -> Case:
+    return Case(
+        f"power {n}",
+        lambda x: torch.pow(x, n),
+        lambda x: x ** arb(n),
+        lambda low, high: power.band(low, high, n),
+        lambda low, high: power.lines(low, high, n),
+        lambda low, high: power.value_range(low, high, n),
+        undefined=lambda low, high: low < 0 or (n < 0 and low == 0),
+        moderate=(0.0, 3.0) if n > 0 else (0.3, 4.0),
+    )
+
+
+def _elu_case(alpha: float) -> Case:
+    return Case(
+        f"elu {alpha}",
+        lambda x: functional.elu(x, alpha),
+        lambda x: x if x > 0 else arb(alpha) * x.expm1(),
+        lambda low, high: elu.band(low, high, alpha),
+        lambda low, high: elu.lines(low, high, alpha),
+        lambda low, high: elu.value_range(low, high, alpha),
+    )
+
+
+def _mish(x: arb) -> arb:
+    return x * _softplus(x).tanh()
+
+
+def _gelu_tanh(x: arb) -> arb:
+    return x * _logistic(2 * arb(gelu.SCALE) * (x + arb(gelu.CUBIC) * x**3))
+
+
+def _staircase_case(name: str, steps: staircase.Staircase, exact: Callable[[arb], arb]) -> Case:
+    return Case(
+        name, steps.value, exact, steps.band, steps.lines, steps.value_range, special=(0.0, 0.5, -0.5, 1.0, 1.5, -2.0)
+    )
+
+
+def _nearest(x: arb) -> arb:
+    found = (x + arb("0.5")).floor()
+    return found - 1 if found == x + arb("0.5") and found.unique_fmpz() % 2 else found
+
+
+def _truncated(x: arb) -> arb:
+    return x.floor() if x >= 0 else x.ceil()
+
+
+def _sawtooth_case(
+    name: str, exact: Callable[[arb], arb], of: tuple[Callable, Callable, Callable], *own: float
+) -> Case:
+    function = {"remainder": torch.remainder, "fmod": torch.fmod, "wrap": lambda x: torch.atan2(x.sin(), x.cos())}[name]
+    band, lines, value_range = of
+    return Case(
+        f"{name} {own}",
+        lambda x: function(x, *own),
+        exact,
+        lambda low, high: band(low, high, *own),
+        lambda low, high: lines(low, high, *own),
+        lambda low, high: value_range(low, high, *own),
+        special=(0.0, *(p * k for p in (own or (math.pi,)) for k in (-3, -1, 1, 2, 5))),
+        largest=1e9,
+    )
 
 
 def _power_case(n: int) -> Case:
@@ -169,6 +240,57 @@ CASES = [
         elu.lines,
         elu.value_range,
     ),
+    _elu_case(0.3),
+    _elu_case(1.7),
+    Case(
+        "gelu",
+        functional.gelu,
+        lambda x: x * (-x / arb(2).sqrt()).erfc() / 2,
+        gelu.band,
+        gelu.lines,
+        gelu.value_range,
+        special=(0.0, -gelu.INFLECTION, gelu.INFLECTION, gelu.LOWEST),
+        ratio=1.005,
+    ),
+    Case(
+        "gelu tanh",
+        lambda x: functional.gelu(x, approximate="tanh"),
+        _gelu_tanh,
+        gelu.tanh_band,
+        gelu.tanh_lines,
+        gelu.tanh_value_range,
+        special=(0.0, -gelu.TANH_INFLECTION, gelu.TANH_INFLECTION, gelu.TANH_LOWEST),
+        ratio=1.005,
+    ),
+    Case(
+        "mish",
+        functional.mish,
+        _mish,
+        mish.band,
+        mish.lines,
+        mish.value_range,
+        special=(0.0, *mish.INFLECTIONS, mish.LOWEST),
+        ratio=1.005,
+    ),
+    Case(
+        "softsign",
+        functional.softsign,
+        lambda x: x / (1 + abs(x)),
+        softsign.band,
+        softsign.lines,
+        softsign.value_range,
+    ),
+    Case(
+        "hardswish",
+        functional.hardswish,
+        lambda x: x * arb.min(arb.max(x + 3, arb(0)), arb(6)) / 6,
+        hardswish.band,
+        hardswish.lines,
+        hardswish.value_range,
+        special=(0.0, -3.0, 3.0, -1.5),
+        moderate=(-6.0, 6.0),
+    ),
+    Case("erf", torch.erf, arb.erf, error_function.band, error_function.lines, error_function.value_range),
     Case(
         "exp", torch.exp, lambda x: x.exp(), exponential.band, exponential.lines, exponential.value_range, largest=700.0
     ),
@@ -203,6 +325,7 @@ CASES = [
         moderate=(0.2, 5.0),
     ),
     *(_power_case(n) for n in (2, 3, 4, 7, -1, -2, -3)),
+    *(_real_power_case(n) for n in (0.3, 1.5, 2.7, -0.5)),
     Case(
         "sin",
         torch.sin,
@@ -239,6 +362,36 @@ CASES = [
         moderate=(-1.4, 1.4),
     ),
 ]
+
+JUMPING = [
+    _staircase_case("floor", staircase.FLOOR, arb.floor),
+    _staircase_case("ceil", staircase.CEIL, arb.ceil),
+    _staircase_case("round", staircase.ROUND, _nearest),
+    _staircase_case("trunc", staircase.TRUNC, _truncated),
+    _staircase_case("sign", staircase.SIGN, lambda x: arb(1 if x > 0 else -1 if x < 0 else 0)),
+    _staircase_case("positive", staircase.POSITIVE, lambda x: arb(1 if x > 0 else 0)),
+    *(
+        _sawtooth_case(
+            "remainder",
+            lambda x, m=m: x - arb(m) * (x / arb(m)).floor(),
+            (sawtooth.remainder_band, sawtooth.remainder_lines, sawtooth.remainder_range),
+            m,
+        )
+        for m in (0.7, 2 * math.pi)
+    ),
+    _sawtooth_case(
+        "fmod",
+        lambda x: x - arb(0.7) * _truncated(x / arb(0.7)),
+        (sawtooth.fmod_band, sawtooth.fmod_lines, sawtooth.fmod_range),
+        0.7,
+    ),
+    _sawtooth_case(
+        "wrap",
+        lambda x: x - 2 * arb.pi() * ((x / arb.pi() - 1) / 2).ceil(),
+        (sawtooth.wrap_band, sawtooth.wrap_lines, sawtooth.wrap_range),
+    ),
+]
+"""Functions that jump: no band is close to them."""
 
 
 def points(case: Case, lower: Tensor, upper: Tensor, slopes: list[Tensor]) -> Tensor:

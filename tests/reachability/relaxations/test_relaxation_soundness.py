@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import Lines, parallel
 
-from .relaxation_cases import CASES, Case, escapes
+from .relaxation_cases import CASES, JUMPING, Case, escapes
 
-cases = pytest.mark.parametrize("case", CASES, ids=str)
+cases = pytest.mark.parametrize("case", [*CASES, *JUMPING], ids=str)
 DRAWN = settings(
     max_examples=12, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
