@@ -24,7 +24,7 @@ from torch import Tensor
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.pipeline.models import tracker_from
 from sagemp_cli.pipeline.problem import problem_of
-from sagemp_cli.pipeline.tubes import flow_of
+from sagemp_cli.pipeline.tubes import flows_of
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.storage import Certificate, TrackerModel, read_artifact
 
@@ -60,7 +60,7 @@ def outside(path: Path, rollouts: int, generator: torch.Generator) -> tuple[int,
     cells = Box(torch.from_numpy(tubes.cell_lower), torch.from_numpy(tubes.cell_upper))
     tube = Tube(torch.from_numpy(tubes.tube_lower), torch.from_numpy(tubes.tube_upper))
     assert tubes.flow is not None
-    flow, w = flow_of(tubes.flow, tube), problem.disturbance
+    ((_, flow),), w = flows_of(tubes.flow, tube), problem.disturbance
     lines, bulge = flow.lines(tube, w, loop.period)
     parts = flow.division.substeps
     per, h = FINE // parts, loop.period / FINE

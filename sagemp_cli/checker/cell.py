@@ -11,6 +11,7 @@ from sagemp_cli.checker.balls import BITS, arb, ball, balls, ctx
 from sagemp_cli.checker.loop import Folded, Loop
 from sagemp_cli.checker.ode import Flow
 from sagemp_cli.checker.part import FlowClaim, PartProver
+from sagemp_cli.checker.requirement import MarginProver, Required
 from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.checker.zonotope import Zonotope
@@ -34,6 +35,7 @@ class CellClaim:
         kept: ``(K, bytes)`` or None.
         deviation: bounds of the output of that name, ``(K, n)``, or None.
         flow: in continuous time, what is claimed between the instants.
+        required: what has to hold there, each with the margin that is claimed.
     """
 
     program: np.ndarray
@@ -52,14 +54,16 @@ class CellClaim:
     kept: np.ndarray | None
     deviation: np.ndarray | None
     flow: FlowClaim | None = None
+    required: tuple[tuple[Required, float], ...] = ()
 
 
-def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None = None) -> str:
+def prove_cell(claim: CellClaim, programs: Sequence[Folded], flows: Sequence[Flow] = ()) -> str:
     """Prove that every real-arithmetic rollout of the programs that starts in the cell stays in the stored tube, under
     every disturbance in its box and with every control and deviation within its stored bounds.
 
-    In continuous time the program is that of a period, and what the boxes of its disturbance stand for is proved of
-    the flow as well: then every solution of the ODE is such a rollout.
+    In continuous time there is a flow for each program, which is that of a period, the same at all of them; what the
+    boxes of its disturbance stand for is proved of the flow as well: then every solution of the ODE is such a rollout.
+    Then what is required holds at all times with the claimed margins.
 
     The answer is empty, or says in one line what could not be proved.
     """
@@ -67,8 +71,8 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None =
         k = 0
         try:
             w = claim.disturbance_lower, claim.disturbance_upper
-            loops = [Loop(folded, claim.windows, *w) for folded in programs]
-            parts = None if flow is None else PartProver(flow, *(side[0, : flow.rate.states] for side in w))
+            loops = {i: Loop(programs[i], claim.windows, *w) for i in set(claim.program.tolist())}
+            parts = _Parts(claim, flows[claim.program[0]], *w) if flows else None
             states, box = Zonotope.box(claim.lower, claim.upper), _box(claim.lower, claim.upper)
             if not ((claim.tube_lower[0] <= claim.lower) & (claim.upper <= claim.tube_upper[0])).all():
                 raise Unproved("the tube does not contain the cell")
@@ -83,9 +87,7 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None =
                 m = claim.control_lower.shape[1]
                 _require_inside(asked[:m], claim.control_lower[k], claim.control_upper[k], "control")
                 if parts is not None:
-                    if claim.flow is None:
-                        raise Unproved("nothing is said of the flow between the instants")
-                    _prove_period(parts, claim.flow, k, box, asked[:m], asked[m:])
+                    parts.prove(k, box, asked[:m], asked[m:])
                 if claim.deviation is not None:
                     if deviation is None:
                         raise Unproved("the program has no deviation")
@@ -96,24 +98,68 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flow: Flow | None =
                 if claim.kept is not None:
                     states = states.reduced(_mask(claim.kept[k], states.generators.shape[1]))
                 _require_inside(box, claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
+                if parts is not None:
+                    parts.require(k, box)
         except (Unproved, ArithmeticError) as e:
             return f"step {k}: {e}"
     return ""
 
 
-def _prove_period(
-    parts: PartProver, flow: FlowClaim, k: int, begin: list[Bounds], control: list[Bounds], inner: list[Bounds]
-) -> None:
-    """Prove what is claimed between two instants; ``inner`` bounds the states at the beginning of parts 2 to S."""
-    n = len(begin)
-    for j in range(flow.lower.shape[1]):
-        if j:
-            begin = inner[(j - 1) * n : j * n]
-            _require_inside(begin, flow.inner_lower[k, j - 1], flow.inner_upper[k, j - 1], f"part {j}: state")
-        try:
-            parts.prove(flow, (k, j), begin, control)
-        except Unproved as e:
-            raise Unproved(f"part {j}: {e}") from None
+class _Parts:
+    """Proves what is claimed between two instants.
+
+    Args:
+        claim: of the cell.
+        flow: the loop's programs.
+        lower, upper: what every period is given, of which W comes first.
+    """
+
+    def __init__(self, claim: CellClaim, flow: Flow, lower: np.ndarray, upper: np.ndarray) -> None:
+        if claim.flow is None:
+            raise Unproved("nothing is said of the flow between the instants")
+        w = lower[0, : flow.rate.states], upper[0, : flow.rate.states]
+        self._flow, self._count, self._prover = claim.flow, flow.substeps, PartProver(flow, *w)
+        self._required = [(MarginProver(one, flow, *w), margin) for one, margin in claim.required]
+        self._begins: list[list[Bounds]] = []
+        self._insides: list[list[Bounds]] = []
+        self._control: list[Bounds] = []
+
+    def prove(self, k: int, begin: list[Bounds], control: list[Bounds], inner: list[Bounds]) -> None:
+        """The flow of period k; ``inner`` bounds the states at the beginning of parts 2 to S.
+
+        Raises:
+            Unproved: it does not follow.
+        """
+        n, flow = len(begin), self._flow
+        self._begins, self._control, self._insides = [begin], control, []
+        for j in range(self._count):
+            if j:
+                begin = inner[(j - 1) * n : j * n]
+                _require_inside(begin, flow.inner_lower[k, j - 1], flow.inner_upper[k, j - 1], f"part {j}: state")
+                self._begins.append(begin)
+            try:
+                self._insides.append(self._prover.prove(flow, (k, j), begin, control))
+            except Unproved as e:
+                raise Unproved(f"part {j}: {e}") from None
+
+    def require(self, k: int, end: list[Bounds]) -> None:
+        """That what is required holds over the period that was proved last, which ends in a box.
+
+        Raises:
+            Unproved: it does not follow.
+        """
+        ends = [*self._begins[1:], end]
+        for prover, margin in self._required:
+            for j, boxes in enumerate(zip(self._begins, ends, self._insides, strict=True)):
+                try:
+                    found = prover.least(k * self._count + j, *boxes, self._control)
+                except Unproved as e:
+                    raise Unproved(f"part {j}: '{prover.required.name}' is not proved: {e}") from None
+                if found is not None and not ball(margin) <= found:
+                    raise Unproved(
+                        f"part {j}: the margin of '{prover.required.name}' is only proved to be {float(found):.9g}, "
+                        f"the file says {margin:.9g}"
+                    )
 
 
 def _record(claim: CellClaim, k: int, folded: Folded) -> list[Entry]:

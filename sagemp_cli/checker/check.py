@@ -39,6 +39,7 @@ class Finding:
         proved: whether SAFE is claimed and was proved.
         reason: why not, in one line; empty if proved.
         clearance: least proved distance of the stored tube to each constraint, by name (m); empty if not proved.
+        margins: proved of each requirement, by name, at least; empty if not proved.
         goal_margin: the same to the goal's faces, by state.
     """
 
@@ -48,6 +49,7 @@ class Finding:
     reason: str
     clearance: Mapping[str, float]
     goal_margin: Mapping[str, float]
+    margins: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ def _findings(
     open_ = [r for r in claims if not reasons[r]]
     for r, reason in _reach_sets(document, open_, processes, progress):
         reasons[r] = reasons[r] or reason
-    return tuple(_finding(r, tubes["verdict"][r], reasons.get(r), margins.get(r)) for r in range(count))
+    return tuple(_finding(document, r, reasons.get(r), margins.get(r)) for r in range(count))
 
 
 def _problems(document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]) -> Iterator[str]:
@@ -215,8 +217,9 @@ def _problems_of_tubes(
                 break
     except Unproved as e:
         yield str(e)
-    if tuple(tubes["constraint_names"]) != safe.names:
-        yield f"the constraints are {', '.join(safe.names)}, the file names {', '.join(tubes['constraint_names'])}"
+    if tuple(tubes["constraint_names"]) != document.constraints:
+        named = ", ".join(tubes["constraint_names"])
+        yield f"the constraints are {', '.join(document.constraints)}, the file names {named}"
 
 
 def _unrecorded(document: Document) -> Iterator[str]:
@@ -259,9 +262,14 @@ def _geometry(
                 raise Unproved("what is said between its instants is not finite")
             if tubes["step"][r] != -1 or tubes["fraction"][r] != 0 or tubes["constraint"][r] != "":
                 raise Unproved("it is called SAFE, but a step or constraint that decided is named")
-            lines = [line for c in np.flatnonzero(own).tolist() for line in lines_of(document, c)]
-            distances = clearances(safe, lines, document.parts)
-            for name, distance, stored in zip(safe.names, distances, tubes["clearance"][r], strict=True):
+            cells = np.flatnonzero(own).tolist() if safe.names else []
+            distances = clearances(safe, [line for c in cells for line in lines_of(document, c)], document.parts)
+            stored_margins = _margins(document, r)
+            for one in document.requirements:
+                if not one.holds(ball(stored_margins[one.name])):
+                    raise Unproved(f"the margin of '{one.name}' is too small: {stored_margins[one.name]:.9g}")
+            of_scene = tubes["clearance"][r][: len(safe.names)]
+            for name, distance, stored in zip(safe.names, distances, of_scene, strict=True):
                 if not distance > 0:
                     raise Unproved(f"its tube is not clear of '{name}'")
                 if distance.is_finite() and not ball(stored) <= distance:
@@ -285,6 +293,12 @@ def _geometry(
     return reasons, margins
 
 
+def _margins(document: Document, r: int) -> dict[str, float]:
+    """What the file says of the requirements of a reference."""
+    said = document.tubes["clearance"][r][len(document.safe.names) :].tolist()
+    return {one.name: margin for one, margin in zip(document.requirements, said, strict=True)}
+
+
 def _reach_sets(
     document: Document, claims: Sequence[int], processes: int, progress: Progress
 ) -> Iterator[tuple[int, str]]:
@@ -296,13 +310,13 @@ def _reach_sets(
         if processes <= 1 or len(cells) < 2:
             folded = _fold(document.steps)
             for c, claim in zip(cells, jobs, strict=True):
-                reason = prove_cell(claim, folded, document.ode)
+                reason = prove_cell(claim, folded, document.odes)
                 task.advance(1)
                 yield int(owner[c]), reason and f"cell {c}, {reason}"
             return
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(
-            min(processes, len(cells)), mp_context=context, initializer=_begin, initargs=(document.steps, document.ode)
+            min(processes, len(cells)), mp_context=context, initializer=_begin, initargs=(document.steps, document.odes)
         ) as pool:
             for c, reason in zip(cells, pool.map(_prove_elsewhere, jobs), strict=True):
                 task.advance(1)
@@ -314,12 +328,12 @@ def _fold(programs: Sequence[Program]) -> list[Folded]:
         return [Folded.of(program) for program in programs]
 
 
-_KNOWN: list[tuple[list[Folded], Flow | None]] = []
+_KNOWN: list[tuple[list[Folded], Sequence[Flow]]] = []
 """Of a worker process: its programs."""
 
 
-def _begin(programs: Sequence[Program], ode: Flow | None) -> None:
-    _KNOWN[:] = [(_fold(programs), ode)]
+def _begin(programs: Sequence[Program], odes: Sequence[Flow]) -> None:
+    _KNOWN[:] = [(_fold(programs), odes)]
 
 
 def _prove_elsewhere(claim: CellClaim) -> str:
@@ -329,8 +343,9 @@ def _prove_elsewhere(claim: CellClaim) -> str:
 def _claim(document: Document, c: int) -> CellClaim:
     tubes, found = document.tubes, document.relaxations
     r = tubes["cell_reference"][c]
+    margins = _margins(document, r)
     return CellClaim(
-        program=document.step_program,
+        program=np.full(document.horizon, document.cell_ode[c]) if document.odes else document.step_program,
         windows=document.windows(r),
         lower=tubes["cell_lower"][c],
         upper=tubes["cell_upper"][c],
@@ -345,27 +360,30 @@ def _claim(document: Document, c: int) -> CellClaim:
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
-        flow=FlowClaim(**{name: side[c] for name, side in document.flow.items()}) if document.flow else None,
+        flow=FlowClaim(**document.flow_of(c)) if document.odes else None,
+        required=tuple((one, margins[one.name]) for one in document.requirements),
     )
 
 
 def _disturbance(document: Document, c: int, side: str) -> np.ndarray:
     """A side of what steps are given, ``(K, d)``: W; in continuous time of each part two means in W and a remainder."""
     w = document.tubes[f"disturbance_{side}"]
-    if document.ode is None:
+    if not document.odes:
         return np.broadcast_to(w, (document.horizon, len(w)))
-    rest = document.flow[f"remainder_{side}"][c]
+    rest = document.flow_of(c)[f"remainder_{side}"]
     mean = np.broadcast_to(w, rest.shape)
     return np.concatenate([mean, mean, rest], axis=-1).reshape(document.horizon, -1)
 
 
 def _finding(
-    r: int, claimed: str, reason: str | None, margins: tuple[dict[str, float], dict[str, float]] | None
-) -> Finding:
+    document: Document, r: int, reason: str | None, margins: tuple[dict[str, float], dict[str, float]] | None
+) -> Finding:  # fmt: skip
+    claimed = document.tubes["verdict"][r]
     if reason is None:
         reason = "the file does not claim that it is safe" if claimed != "SAFE" else "see the problems of the file"
-    clearance, goal = margins if margins is not None and not reason else ({}, {})
-    return Finding(r, claimed, not reason, reason, clearance, goal)
+    proved = not reason
+    clearance, goal = margins if margins is not None and proved else ({}, {})
+    return Finding(r, claimed, proved, reason, clearance, goal, _margins(document, r) if proved else {})
 
 
 def _replayed(document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]) -> tuple[tuple[int, str], ...]:

@@ -13,10 +13,17 @@ import numpy as np
 
 from sagemp_cli.checker.between import CONTINUOUS, SAMPLES
 from sagemp_cli.checker.document import Document
-from sagemp_cli.checker.equations import Names, control_equations, equations, matrix_of, rate_equations
+from sagemp_cli.checker.equations import (
+    Names,
+    control_equations,
+    equations,
+    margin_equations,
+    matrix_of,
+    rate_equations,
+)
 from sagemp_cli.checker.ode import Flow
 from sagemp_cli.checker.program import Program
-from sagemp_cli.checker.scene import SafeSet
+from sagemp_cli.checker.requirement import Required
 
 _NETWORK = 8  # rows and columns from which on a matrix is called a network's
 _MOST_REFERENCES = 12
@@ -38,7 +45,7 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     w_names = disturbance_names(document)
     rows = [
         ("for", _times(document)),
-        *([("between", _between(document))] if safe.names else []),
+        *([("between", _between(document))] if document.constraints else []),
         ("X_I", _box(*sets[0].corners(), names, units)),
         ("W", _box(*sets[1].corners(), w_names, [""] * len(w_names))),
         *([("w enters", text) for text in [_entrance(document)] if text] if document.ode is None else []),
@@ -46,11 +53,15 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
     ]
     tubes = document.tubes
     safe_ones = [r for r, v in enumerate(tubes["verdict"]) if v == "SAFE"] or list(range(len(tubes["verdict"])))
-    rows.append(("proves", _aims(safe, *(("x_k", "x_K") if document.ode is None else ("x(k dt)", "x(K dt)")))))
+    rows.append(("proves", _aims(document)))
     if safe.workspace is not None:
         places = [names[i] for i in document.position], [units[i] for i in document.position]
         rows.append(("workspace", _box(*safe.workspace, *places)))
     rows += [("obstacle", _obstacle(o)) for o in safe.obstacles]
+    rows += [row for one in document.requirements for row in _requirement(document, one)]
+    if document.requirements:
+        programs = ", ".join(one.margins.fingerprint()[:16] for one in document.requirements)
+        rows.append(("their programs", f"sha256 {programs}"))
     if safe.goal is not None:
         rows.append(("goal at K" if document.ode is None else "goal at K dt", _box(*safe.goal, names, units)))
     if document.control_names and safe_ones:
@@ -64,7 +75,7 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
         if len(tubes["references"]) > _MOST_REFERENCES:
             rows.append(("references", f"{len(tubes['references']) - _MOST_REFERENCES} more"))
     if document.ode is not None:
-        rows.append(("how it is proved", _method(document, document.ode)))
+        rows.append(("how it is proved", _method(document)))
     return rows
 
 
@@ -81,7 +92,7 @@ def _times(document: Document) -> str:
 
 def _ode(document: Document, ode: Flow) -> list[tuple[str, str]]:
     """The right-hand side, in full if it is not long, and how the control is held."""
-    rate = rate_equations(ode.rate, _names(document))
+    rate = rate_equations(ode.rate, _disturbed_names(document))
     if len(rate) > _MOST_EQUATIONS or max(map(len, rate), default=0) > _LONGEST_EQUATION:
         chain = _chain(ode.rate, sorted(_behind(ode.rate, ode.rate.next)))
         rate = [f"x'(t) = f(x(t), u_k) + w(t), f {chain}; its equations: sagemp inspect --equations"]
@@ -97,11 +108,16 @@ def _ode(document: Document, ode: Flow) -> list[tuple[str, str]]:
     return rows
 
 
-def _method(document: Document, ode: Flow) -> str:
-    parts = "each period as a whole" if ode.substeps == 1 else f"each period in {ode.substeps} parts"
+def _method(document: Document) -> str:
+    counts = np.bincount(document.cell_ode, minlength=len(document.odes)).tolist()
+    ways = []
+    for ode, count in zip(document.odes, counts, strict=True):
+        parts = "each period as a whole" if ode.substeps == 1 else f"each period in {ode.substeps} parts"
+        of = f"{count} cell{'s' * (count != 1)}: " if len(counts) > 1 else ""
+        ways.append(f"{of}{parts}, Taylor polynomials of degree {ode.order}")
     return (
-        f"{parts}, Taylor polynomials of degree {ode.order} with proved remainders, {document.parts} boxes along each; "
-        f"{len(document.tubes['cell_reference'])} cells"
+        f"{'; '.join(ways)}; with proved remainders, {document.parts} boxes along each part; {sum(counts)} "
+        f"cell{'s' * (sum(counts) != 1)}"
     )
 
 
@@ -109,10 +125,19 @@ def _names(document: Document) -> Names:
     return Names(document.state_names, document.control_names, disturbance_names(document))
 
 
+def _disturbed_names(document: Document) -> Names:
+    """The same, without names of disturbances that are always 0."""
+    tubes, names = document.tubes, _names(document)
+    sides = zip(names.disturbances, tubes["disturbance_lower"], tubes["disturbance_upper"], strict=True)
+    return Names(names.states, names.controls, [name if low or high else "" for name, low, high in sides])
+
+
 def _between(document: Document) -> str:
     """What is claimed of the time between two samples."""
     if document.between == SAMPLES:
         return "samples: the safe set is kept at the samples; of the time between them NOTHING is claimed"
+    if document.between == CONTINUOUS and not document.safe.names:
+        return "continuous: every solution of the ODE does what is required, between the samples too"
     if document.between == CONTINUOUS:
         return "continuous: the safe set is kept at all of these times, by every solution of the ODE; the goal at K dt"
     return (
@@ -139,7 +164,8 @@ def equation_lines(document: Document) -> list[str]:
     names, out = _names(document), list[str]()
     if document.ode is not None:
         out += ["u_k, from x = x(t_k), held on [t_k, t_k + dt]:", *control_equations(document.programs[0], names)]
-        out += ["x'(t), at all times:", *rate_equations(document.ode.rate, names)]
+        out += ["x'(t), at all times:", *rate_equations(document.ode.rate, _disturbed_names(document))]
+    out += [f"{label}: {text}" for one in document.requirements for label, text in _requirement(document, one)]
     for i, program in enumerate(document.programs if document.ode is None else ()):
         if len(document.programs) > 1:
             steps = np.flatnonzero(document.step_program == i)
@@ -190,14 +216,69 @@ def _obstacle(obstacle: tuple[str, str, list[float], Any]) -> str:
     return f"{name}: block from ({place}) to ({', '.join(f'{v:.6g}' for v in second)})"
 
 
-def _aims(safe: SafeSet, first: str, last: str) -> str:
+def _aims(document: Document) -> str:
     """What a verdict of SAFE says."""
+    safe, asked = document.safe, document.requirements
+    first, last = ("x_k", "x_K") if document.ode is None else ("x(k dt)", "x(K dt)")
     parts = [f"{first} stays in its tube"]
     if safe.workspace is not None:
         parts.append("in the workspace")
-    parts.append(f"clear of {len(safe.obstacles)} obstacles" if safe.obstacles else "no obstacle is claimed")
-    parts.append(f"{last} is in the goal" if safe.goal is not None else "no goal is claimed")
+    if asked:
+        parts.append(f"{len(asked)} requirement{'s hold' if len(asked) > 1 else ' holds'}")
+    if safe.obstacles or not asked:
+        parts.append(f"clear of {len(safe.obstacles)} obstacles" if safe.obstacles else "no obstacle is claimed")
+    if safe.goal is not None or not asked:
+        parts.append(f"{last} is in the goal" if safe.goal is not None else "no goal is claimed")
     return ", ".join(parts)
+
+
+def _requirement(document: Document, one: Required) -> list[tuple[str, str]]:
+    """What has to hold, and when: bounds as bounds, all else as equations."""
+    label, when = f"requirement {one.name}", _interval(document, one)
+    sides = _sides(one, len(document.state_names))
+    if sides is not None:
+        box = _box(*sides, document.state_names, document.state_units)
+        return [(label, f"{when}: {box}" if one.every else f"{when}: not in the box {box}")]
+    lines = margin_equations(one.margins, _names(document))
+    sign, names = ">" if one.strict else ">=", [line.split(" = ")[0] for line in lines[-one.margins.controls :]]
+    if one.margins.controls == 1:
+        lines[-1] = f"{lines[-1].split(' = ', 1)[1]} {sign} 0"
+    else:
+        lines.append(f"{'all' if one.every else 'at each time one'} of {', '.join(names)} {sign} 0")
+    return [(label, f"{when}: {lines[0]}"), *((label, line) for line in lines[1:])]
+
+
+def _interval(document: Document, one: Required) -> str:
+    """When a requirement has to hold, in words and seconds."""
+    last, dt = document.horizon, document.dt
+    assert dt is not None
+    if (one.first, one.last) == (0, last):
+        return "at all these times"
+    if one.first == one.last:
+        return f"at t = {'K' if one.first == last else f'{one.first:.10g}'} dt = {one.first * dt:.6g} s"
+    ends = f"{one.first:.10g} dt", "K dt" if one.last == last else f"{one.last:.10g} dt"
+    return f"at all t in [{', '.join(ends)}] = [{one.first * dt:.6g}, {one.last * dt:.6g}] s"
+
+
+def _sides(one: Required, n: int) -> tuple[list[float], list[float]] | None:
+    """Of margins that are distances from faces of a box, that box; None of all others.
+
+    All margins of a box that is to be kept are at least 0; of a box that is to be kept out of one is above 0.
+    """
+    i = one.margins.instructions[one.margins.control]
+    if i.kind != "linear" or i.reads != (0,) or one.strict is one.every:
+        return None
+    lower, upper = [-np.inf] * n, [np.inf] * n
+    for row, shift in zip(*matrix_of(i, n), strict=True):
+        (places,) = np.nonzero(row)
+        if len(places) != 1 or abs(row[places[0]]) != 1:
+            return None
+        place, rising = int(places[0]), bool(row[places[0]] > 0)
+        side = lower if rising is one.every else upper
+        if np.isfinite(side[place]):
+            return None
+        side[place] = float(-shift if rising else shift)
+    return lower, upper
 
 
 def _models(document: Document) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.points import Point, outputs_at
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet
-from sagemp_cli.checker.solution import followed
+from sagemp_cli.checker.solution import PARTS, followed
 from sagemp_cli.checker.unproved import Unproved
 
 BITS = 512  # a rollout has no other errors than rounding, which the loop may amplify
@@ -43,10 +43,11 @@ def replay(
 
 
 def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[Ends, Ends], safe: SafeSet) -> str:
-    """Prove that a rollout from X_I under disturbances in W leaves the safe set or misses the goal.
+    """Prove that a rollout from X_I under disturbances in W leaves the safe set, misses the goal or breaks what is
+    required.
 
     It does so at its step, or at the fraction of it that the record says, on the straight line to the next sample; in
-    continuous time as a solution under a disturbance that is constant on every period.
+    continuous time as a solution under a disturbance that is constant on equal pieces of every period.
 
     The start and the disturbances are taken from the record as exact numbers, nothing else is. The boxes stored beside
     the tubes may be larger than X_I and W: from there everything is moved into the nearest point of those.
@@ -76,18 +77,46 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
             raise Unproved(f"its time, {fraction:.6g} of step {step} over, is none that the claim speaks of")
         with ctx.workprec(BITS):
             programs = [document.programs[i] for i in document.step_program]
-            rows = disturbances[: step + (fraction > 0)]
-            x0, w = _moved(first, sets[0]), [_moved(row, sets[1]) for row in rows]
+            x0, windows = _moved(first, sets[0]), document.windows(r)
             if document.ode is not None:
-                now = followed(document.ode, document.programs[0], x0, w, document.windows(r), fraction)
-            else:
-                x = replay(programs, x0, w, document.windows(r))
-                now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
+                w = [_moved(row, sets[1]) for row in disturbances]
+                return _broken_by_solution(document, (x0, w, windows, step, fraction), safe)
+            w = [_moved(row, sets[1]) for row in disturbances[: step + (fraction > 0)]]
+            x = replay(programs, x0, w, windows)
+            now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
             if _violates(now, document.position, safe, at_end=step == last):
                 return ""
             raise Unproved(f"its replay violates nothing for certain at step {step + fraction:.10g}")
     except (Unproved, ArithmeticError) as e:
         return str(e)
+
+
+def _broken_by_solution(
+    document: Document, given: tuple[Point, list[Point], np.ndarray, int, float], safe: SafeSet
+) -> str:  # fmt: skip
+    """Why a solution of the ODE breaks nothing for certain at a time, or nothing if it does.
+
+    Args:
+        document: the file.
+        given: start, signal, windows, period and fraction of it, see :func:`~sagemp_cli.checker.solution.followed`.
+        safe: what the loop must stay in.
+    """
+    assert document.ode is not None
+    step, fraction = given[3:]
+    time = ball(step) + ball(fraction)  # exact
+    asked = [one for one in document.requirements if ball(one.first) <= time and time <= ball(one.last)]
+    why = ""
+    for parts in PARTS:
+        try:
+            now = followed(document.ode, document.programs[0], *given, parts=parts)
+        except Unproved as e:
+            why = str(e)
+            continue
+        at_end = step == document.horizon
+        if any(one.broken_at(now) for one in asked) or _violates(now, document.position, safe, at_end=at_end):
+            return ""
+        why = f"its replay violates nothing for certain at step {step + fraction:.10g}"
+    return why
 
 
 def _exact(values: Sequence[Any]) -> Point:
@@ -125,7 +154,9 @@ def applies(example: Mapping[str, Any], document: Document) -> bool:
         isinstance(states, np.ndarray)
         and isinstance(w, np.ndarray)
         and states.shape == (rows, n)
-        and w.shape == (rows - 1, len(tubes["disturbance_lower"]))
+        and w.ndim == 2
+        and w.shape[1] == len(tubes["disturbance_lower"])
+        and (w.shape[0] == rows - 1 or document.ode is not None)
         and isinstance(reference, int | np.integer)
         and 0 <= reference < len(tubes["verdict"])
         and isinstance(example.get("step"), int | np.integer)

@@ -17,6 +17,7 @@ import yaml
 from sagemp_cli.checker.between import CONTINUOUS, MOST_PARTS, SAMPLES, SEGMENTS
 from sagemp_cli.checker.ode import Flow, flow_of
 from sagemp_cli.checker.program import Instruction, Program
+from sagemp_cli.checker.requirement import MOST_REQUIREMENTS, Required
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.errors import ArtifactError
@@ -25,7 +26,7 @@ from sagemp_cli.reading.reader import read_tree
 from sagemp_cli.reading.tree import Dataset, Group
 from sagemp_cli.storage.content import ContentError, content_hash
 
-KINDS = {"sagemp/certificate": 3, "sagemp/library": 3}
+KINDS = {"sagemp/certificate": 4, "sagemp/library": 4}
 """Schemas that can be checked, with the version of their format."""
 _COMMANDS = {"sagemp/certificate": "verify", "sagemp/library": "build-library"}
 
@@ -55,8 +56,10 @@ class Document:
         counterexamples: attributes and datasets of each.
         deviation: of a learned robot from its analytical model, ``(R, K, n)``, if the claim is about that model.
         true_model: a learned robot's claim about its analytical model; the same file, other tubes and another program.
-        ode: in continuous time the loop's period as programs.
-        flow: in continuous time, datasets of ``/data/tubes/flow`` by name.
+        odes: in continuous time the loop's period as programs, for each way in which the period of a cell is divided.
+        cell_ode: which of them each cell takes, ``(C,)``.
+        flow: in continuous time, datasets of ``/data/tubes/flow`` by name, padded to the most parts of a cell.
+        requirements: what has to hold beside the scene.
     """
 
     kind: str
@@ -81,13 +84,30 @@ class Document:
     counterexamples: tuple[Mapping[str, Any], ...]
     deviation: np.ndarray | None = None
     true_model: Document | None = None
-    ode: Flow | None = None
+    odes: tuple[Flow, ...] = ()
+    cell_ode: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     flow: Mapping[str, np.ndarray] = field(default_factory=dict)
+    requirements: tuple[Required, ...] = ()
+
+    @property
+    def ode(self) -> Flow | None:
+        """In continuous time, of which all speak alike: right-hand side and control. None in discrete time."""
+        return self.odes[0] if self.odes else None
 
     @property
     def steps(self) -> tuple[Program, ...]:
         """The programs of a step: of a period, in continuous time."""
-        return self.programs if self.ode is None else (self.ode.step,)
+        return tuple(ode.step for ode in self.odes) if self.odes else self.programs
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Names of all that is kept: the scene's constraints, then the requirements."""
+        return (*self.safe.names, *(one.name for one in self.requirements))
+
+    def flow_of(self, c: int) -> dict[str, np.ndarray]:
+        """The datasets between the samples of a cell, of its own parts."""
+        parts = self.odes[self.cell_ode[c]].substeps
+        return {name: side[c][:, : parts - name.startswith("inner")] for name, side in self.flow.items()}
 
     @property
     def horizon(self) -> int:
@@ -142,8 +162,8 @@ def _read(file: Group, path: Path) -> Document:
     if version < KINDS[schema]:
         command = "prove" if file.attrs.get("stage") == "prove" else _COMMANDS[schema]
         raise ArtifactError(
-            f"{path}: format {version} of '{schema}' is an old one, which does not say what holds between the samples; "
-            f"make it again with 'sagemp {command} --overwrite'"
+            f"{path}: format {version} of '{schema}' is an old one, {KINDS[schema]} can be checked; make it again with "
+            f"'sagemp {command} --overwrite'"
         )
     stored = str(file.attrs.get("content_sha256", ""))
     if not stored:
@@ -152,13 +172,16 @@ def _read(file: Group, path: Path) -> Document:
         raise ArtifactError(f"{path}: the content was changed after it was written (its hash differs)")
     config = _config(file.dataset("config")[()])
     data = file.group("data")
-    _require_known(data, "tubes", "loop", "counterexamples", "true_model", "samples", *_REJECTED)
+    _require_known(data, "tubes", "loop", "counterexamples", "true_model", "samples", "requirements", *_REJECTED)
     examples = data.group("counterexamples") if "counterexamples" in data else Group("/data/counterexamples", {})
     tubes = _tubes(data.group("tubes"), path)
     _, rows, n = tubes["tubes"]["tube_lower"].shape
     d = len(tubes["tubes"]["disturbance_lower"])
     loop = _loop(data.group("loop"), n, d, rows - 1)
-    ode = _ode(loop, loop.pop("rate"), tubes)
+    odes, cell_ode = _odes(loop, loop.pop("rate"), tubes)
+    asked = _requirements(data.group("requirements"), n, rows - 1) if "requirements" in data else ()
+    if asked and not odes:
+        raise ArtifactError(f"{path}: /data/requirements are of loops in continuous time, this one is not")
     document = Document(
         kind=schema.removeprefix("sagemp/"),
         config=config,
@@ -170,7 +193,9 @@ def _read(file: Group, path: Path) -> Document:
         **tubes,
         **loop,
         **_problem(config, n, d, loop, path),
-        ode=ode,
+        odes=odes,
+        cell_ode=cell_ode,
+        requirements=asked,
         verdict=str(data.attrs.get("verdict", "")),
         counterexamples=tuple(
             {**example.attrs, **{key: _dataset(example.dataset(key)) for key in example}}
@@ -180,7 +205,7 @@ def _read(file: Group, path: Path) -> Document:
     _require_fitting(document, path)
     if "true_model" not in data:
         return document
-    if ode is not None:
+    if odes:
         raise ArtifactError(f"{path}: a claim in continuous time has no /data/true_model")
     true = _tubes(data.group("true_model/tubes"), path)
     true.pop("said")
@@ -206,21 +231,51 @@ _SAMPLES = ("drawn", "certified")
 _SAID = ("experiment", "stage", "status", "version", "created_utc", "seconds")
 
 
-def _ode(loop: Mapping[str, Any], rate: Program | None, tubes: Mapping[str, Any]) -> Flow | None:
-    """The period of a loop in continuous time, if it is one: then all of the file says so."""
+def _odes(
+    loop: Mapping[str, Any], rate: Program | None, tubes: Mapping[str, Any]
+) -> tuple[tuple[Flow, ...], np.ndarray]:  # fmt: skip
+    """The periods of a loop in continuous time, if it is one, and which a cell takes: then all of the file says so."""
     flow, continuous = tubes["flow"], tubes["between"] == CONTINUOUS
     if not continuous and rate is None and not flow:
-        return None
+        return (), np.zeros(0, np.int64)
     if not continuous or rate is None or not flow:
         raise ValueError(
             "a claim in continuous time needs 'between: continuous', its right-hand side /data/loop/rate, and "
             "/data/tubes/flow"
         )
-    _, _, substeps, n = flow["lower"].shape
+    n = flow["lower"].shape[-1]
     if loop["dt"] is None or len(loop["programs"]) != 1 or len(tubes["tubes"]["disturbance_lower"]) != n:
         raise ValueError("a claim in continuous time needs dt, one control, and a disturbance for every state")
-    order = int(flow.pop("order")[()])
-    return flow_of(loop["programs"][0], rate, period=loop["dt"], substeps=substeps, order=order)
+    divisions, which = np.unique(np.stack([flow.pop("substeps"), flow.pop("order")], 1), axis=0, return_inverse=True)
+    if not 1 <= len(divisions) <= _MOST_DIVISIONS:
+        raise ValueError(f"its periods are divided in {len(divisions)} ways; 1 to {_MOST_DIVISIONS} can be checked")
+    made = [
+        flow_of(loop["programs"][0], rate, period=loop["dt"], substeps=substeps, order=order)
+        for substeps, order in divisions.tolist()
+    ]
+    return tuple(made), which.reshape(-1)
+
+
+def _requirements(group: Group, n: int, periods: int) -> tuple[Required, ...]:
+    """What a group asks for."""
+    if len(group) > MOST_REQUIREMENTS:
+        raise ValueError(f"{group.name} holds {len(group)} requirements; {MOST_REQUIREMENTS} can be checked")
+    found = []
+    for one in map(group.group, sorted(group)):
+        _require_known(one, "margins")
+        name, every, strict, first, last = (one.attrs[key] for key in ("name", "every", "strict", "first", "last"))
+        if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_NAME:
+            raise ValueError(f"{one.name} needs a short name")
+        if not all(isinstance(v, bool | np.bool_) for v in (every, strict)):
+            raise ValueError(f"{one.name}: every and strict are truth values")
+        if not all(isinstance(v, float | np.floating) for v in (first, last)):
+            raise ValueError(f"{one.name}: first and last are float64 numbers")
+        margins = _program(one.group("margins"), n, n, 0)
+        found.append(Required(name, margins, bool(every), bool(strict), float(first), float(last)))
+        found[-1].require_sense(n, periods)
+    if len({one.name for one in found}) < len(found):
+        raise ValueError(f"{group.name} has a name twice")
+    return tuple(found)
 
 
 def _plain(value: Any) -> Any:
@@ -324,6 +379,7 @@ def _parts(group: Group, name: str, begin: str, kind: type, count: int) -> list[
 _NAMES = ("state_names", "state_units", "control_names", "control_units")
 _MOST_LOOKAHEAD = 10_000
 _LONGEST_NAME = 60
+_MOST_DIVISIONS = 16
 
 
 def _config(text: str) -> Any:
@@ -364,17 +420,24 @@ _FLOW = ("lower", "upper", "remainder_lower", "remainder_upper", "curve", "drift
 
 
 def _flow(group: Group, tube: tuple[int, int, int]) -> dict[str, np.ndarray]:
-    """What a group says of the time between the samples; ``order`` beside the arrays."""
-    _require_known(group, "inner_lower", "inner_upper", *_FLOW)
-    substeps, order = int(group.attrs["substeps"]), int(group.attrs["order"])
+    """What a group says of the time between the samples."""
+    _require_known(group, "substeps", "order", "inner_lower", "inner_upper", *_FLOW)
     cells, rows, n = tube
-    shapes = dict.fromkeys(_FLOW, (cells, rows - 1, substeps, n))
-    shapes |= dict.fromkeys(("inner_lower", "inner_upper"), (cells, rows - 1, substeps - 1, n))
+    substeps, order = (_dataset(group.dataset(name)) for name in ("substeps", "order"))
+    for name, given in (("substeps", substeps), ("order", order)):
+        if given.shape != (cells,) or given.dtype != np.int64:
+            raise ValueError(f"{group.name}/{name} must be int64 of shape {(cells,)}")
+    most = int(substeps.max(initial=1))
+    shapes = dict.fromkeys(_FLOW, (cells, rows - 1, most, n))
+    shapes |= dict.fromkeys(("inner_lower", "inner_upper"), (cells, rows - 1, most - 1, n))
     found = {name: _dataset(group.dataset(name)) for name in shapes}
     for name, shape in shapes.items():
         if found[name].shape != shape or found[name].dtype != np.float64:
             raise ValueError(f"{group.name}/{name} must be float64 of shape {shape}")
-    return found | {"order": np.array(order)}
+        own = substeps - name.startswith("inner")
+        if (found[name] != 0).any(where=(np.arange(shape[2]) >= own[:, None])[:, None, :, None]):
+            raise ValueError(f"{group.name}/{name} says something of parts that a cell does not have")
+    return found | {"substeps": substeps, "order": order}
 
 
 def _require_known(group: Group, *names: str) -> None:

@@ -5,6 +5,7 @@ What is shown is rounded to six digits and proves nothing; the numbers themselve
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -49,9 +50,17 @@ def control_equations(program: Program, names: Names) -> list[str]:
 
 
 def rate_equations(program: Program, names: Names) -> list[str]:
-    """The same of a right-hand side of an ODE: ``x'`` is the rate of the state, the disturbance added to it."""
+    """The same of a right-hand side of an ODE: ``x'`` is the rate of the state, with the disturbances that have a name
+    added to it."""
     writer = _Writer(program, names, numbers=names.controls)
     return [*writer.lines(), *writer.after(plus=names.disturbances)]
+
+
+def margin_equations(program: Program, names: Names) -> list[str]:
+    """The same of the margins of a requirement, which are called ``g``; those come last, one line each."""
+    labels = [f"g{i + 1}" for i in range(program.controls)] if program.controls > 1 else ["g"]
+    writer = _Writer(program, Names(names.states, labels, names.disturbances))
+    return writer.margins()
 
 
 @dataclass
@@ -86,14 +95,25 @@ class _Writer:
             return []
         after = self.texts[program.next]
         if isinstance(after, str):
-            self.out.append(f"x' = {after}{' + w' if plus else ''}")
+            self.out.append(f"x' = {after}{' + w' if any(plus) else ''}")
         else:
-            after = [_sum([text, w], 0.0) for text, w in zip(after, plus, strict=True)] if plus else after
+            after = [
+                _sum([text, w], 0.0) if w else text for text, w in zip(after, plus or [""] * len(after), strict=True)
+            ]
             self._say((f"{name}'", text) for name, text in zip(self.names.states, after, strict=True))
         if program.deviation >= 0:
             found = self.texts[program.deviation]
             self._say([("deviation", found if isinstance(found, str) else f"({', '.join(found)})")])
         return self.out[before:]
+
+    def margins(self) -> list[str]:
+        """Of its output ``control`` one line each, after all that they are made of."""
+        program, names = self.program, list(self.names.controls)
+        made = dataclasses.replace(self, program=dataclasses.replace(program, control=-1, next=program.control))
+        lines, text = made.lines(), made.texts[program.control]
+        if isinstance(text, str):
+            return [*lines, *(f"{name} = {text}[{i}]" for i, name in enumerate(names))]
+        return [*lines, *(f"{name} = {entry}" for name, entry in zip(names, text, strict=True))]
 
     def _say(self, pairs) -> None:
         self.out += [f"{name} = {text}" for name, text in pairs if name != text]

@@ -14,6 +14,7 @@ from sagemp_cli.checker.balls import arb, arb_mat, ball, balls
 from sagemp_cli.checker.functions import FUNCTIONS, function_of
 from sagemp_cli.checker.points import Point
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
+from sagemp_cli.checker.ranges import values as ranges_of
 from sagemp_cli.checker.unproved import Unproved
 
 Interval = tuple[arb, arb]
@@ -39,12 +40,13 @@ class Bounds:
     """A program that bounds its output ``control`` or ``next``.
 
     Args:
-        program: it; only smooth instructions are known.
+        program: it.
         output: the slot that is wanted.
+        smooth: whether there are bounds only where the program is smooth: where no angle jumps.
     """
 
-    def __init__(self, program: Program, output: int) -> None:
-        self._program, self._output = program, output
+    def __init__(self, program: Program, output: int, *, smooth: bool = True) -> None:
+        self._program, self._output, self._smooth = program, output, smooth
         needed = {output}
         for slot in range(output, -1, -1):
             if slot in needed:
@@ -76,7 +78,7 @@ class Bounds:
                 reads = [values[r] for r in i.reads]
                 count = max(map(len, reads))
                 spread = [v if len(v) == count else v * count for v in reads]
-                values[slot] = [_result(i, columns) for columns in zip(*spread, strict=True)]
+                values[slot] = [_result(i, columns, smooth=self._smooth) for columns in zip(*spread, strict=True)]
         return values[self._output]
 
 
@@ -99,24 +101,36 @@ def _linear(up: arb_mat, down: arb_mat, bias: Point, value: Value) -> Value:
     ]  # fmt: skip
 
 
-def _result(i: Instruction, reads: Sequence[Column]) -> Column:
+def _result(i: Instruction, reads: Sequence[Column], *, smooth: bool) -> Column:
     kind = i.kind
     if kind == "pick":
         return [reads[0][e] for e in i.entries.tolist()]
     if kind == "join":
         return [entry for column in reads for entry in column]
-    if kind in _PAIRS:
+    if len(reads) == 2:
         width = max(map(len, reads))
         left, right = (column if len(column) == width else column * width for column in reads)
+        if kind not in _PAIRS or (kind == "atan2" and not smooth):
+            return _unsmooth(i, [left, right])
         if kind == "mul" and i.reads[0] == i.reads[1]:
             return [_power(a, 2) for a in left]
         return [_PAIRS[kind](a, b) for a, b in zip(left, right, strict=True)]
     if kind == "pow":
         exponent = float(i.constants[0])
         return [_real_power(a, exponent) if exponent % 1 else _power(a, int(exponent)) for a in reads[0]]
-    if kind in ("remainder", "fmod", "wrap"):
+    if kind in _JUMPS and smooth:
         return [_left(function_of(kind, i.constants.tolist()), a) for a in reads[0]]
-    return [_FUNCTIONS[kind](a) for a in reads[0]]
+    return [_FUNCTIONS[kind](a) for a in reads[0]] if kind in _FUNCTIONS else _unsmooth(i, reads)
+
+
+def _unsmooth(i: Instruction, reads: Sequence[Column]) -> Column:
+    """Of what has a kink, or may jump."""
+    found = []
+    for entry in ranges_of(i, reads):
+        if entry is None:
+            raise Unproved(f"'{i.kind}' of an interval has no bound")
+        found.append(entry)
+    return found
 
 
 # -- pairs -------------------------------------------------------------------------------------------------------------
@@ -287,6 +301,9 @@ def _silu(a: Interval) -> Interval:
 def _rising(function: Callable[[arb], arb]) -> Callable[[Interval], Interval]:
     return lambda a: (function(a[0]), function(a[1]))
 
+
+_JUMPS = ("remainder", "fmod", "wrap")
+"""Functions of one value that are smooth where they do not jump."""
 
 _FUNCTIONS: Mapping[str, Callable[[Interval], Interval]] = {
     "neg": lambda a: a if a is NOTHING else (-a[1], -a[0]),

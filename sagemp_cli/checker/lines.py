@@ -16,13 +16,15 @@ def lines_of(document: Document, c: int) -> list[Line]:
     Raises:
         Unproved: a bound is not finite.
     """
-    place, tubes, flow, ode = list(document.position), document.tubes, document.flow, document.ode
+    place, tubes, odes = list(document.position), document.tubes, document.odes
+    ode = odes[document.cell_ode[c]] if odes else None
+    flow = document.flow_of(c) if odes else {}
 
     def over(side: str) -> np.ndarray:
         tube = tubes[f"tube_{side}"][c]
         if ode is None:
             return tube[:, place]
-        rows = np.concatenate([tube[:-1, None], flow[f"inner_{side}"][c]], axis=1).reshape(-1, tube.shape[1])
+        rows = np.concatenate([tube[:-1, None], flow[f"inner_{side}"]], axis=1).reshape(-1, tube.shape[1])
         return np.concatenate([rows, tube[-1:]])[:, place]
 
     boxes = boxes_of(over("lower"), over("upper"))
@@ -32,7 +34,7 @@ def lines_of(document: Document, c: int) -> list[Line]:
     if ode is None:
         return [Line(first, last) for first, last in ends]
     lower, upper, curve, drift = (
-        [balls(row[place]) for row in flow[name][c].reshape(len(ends), -1)]
+        [balls(row[place]) for row in flow[name].reshape(len(ends), -1)]
         for name in ("lower", "upper", "curve", "drift")
     )
     w = zip(*(balls(tubes[f"disturbance_{side}"][place]) for side in ("lower", "upper")), strict=True)

@@ -63,8 +63,11 @@ class PartProver:
         self._coefficients = Bounds(flow.coefficients, flow.coefficients.control)
         self._slope = Bounds(flow.slope, flow.slope.control)
 
-    def prove(self, claim: FlowClaim, place: tuple[int, int], begin: Column, control: Column) -> None:
+    def prove(self, claim: FlowClaim, place: tuple[int, int], begin: Column, control: Column) -> Column:
         """Prove what is claimed of part j of period k, which begins in a box, under controls in another.
+
+        Returns:
+            Y, which no solution leaves within the part.
 
         Raises:
             Unproved: it does not follow.
@@ -86,6 +89,7 @@ class PartProver:
         for i, ((a, b), curve) in enumerate(zip(second, balls(claim.curve[place]), strict=True)):
             if not (-curve <= a * h * h and b * h * h <= curve):
                 raise Unproved(f"the path of state {i} may bend more than the file says, {float(curve):.9g}")
+        return inside
 
     def _image(self, lower: np.ndarray, upper: np.ndarray, begin: Column, control: Column, h: arb) -> Column:
         """Y, if it lies in X."""

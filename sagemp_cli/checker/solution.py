@@ -1,4 +1,4 @@
-"""One solution of an ODE under a disturbance that is constant on every period, followed in intervals.
+"""One solution of an ODE under a disturbance that is constant on equal pieces of every period, followed in intervals.
 
 There is one start and one signal, so a box around the solution is as narrow as the arithmetic and the remainder of a
 Taylor polynomial of a high degree let it be; the loop widens it from period to period, and many digits are kept for
@@ -20,45 +20,59 @@ from sagemp_cli.checker.taylor import solution
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.checker.writing import Writer
 
-ORDER, PARTS = 14, 16
-"""Degree of the polynomials, and parts of a period."""
+ORDER = 14
+"""Degree of the polynomials."""
+PARTS = (2, 16)
+"""Parts of a period at least: a few, which mostly do, and then as many as may help."""
+MOST_PIECES = 1024
+"""Of a period, on which the disturbance is constant."""
 _ROUNDS = 20
 
 
 def followed(
-    ode: Flow, control: Program, start: Point, signal: Sequence[Point], windows: np.ndarray, fraction: float
-) -> Point:
-    """A box around the state after the periods of a signal, of the last of which only a fraction passes if it is not 0.
+    ode: Flow, control: Program, start: Point, signal: Sequence[Point], windows: np.ndarray, step: int, fraction: float,
+    parts: int,
+) -> Point:  # fmt: skip
+    """A box around the state after some periods and a fraction of the next.
 
     Args:
         ode: the loop's flow.
         control: its control.
         start: x(0).
-        signal: w on each period.
+        signal: w on each of equally many pieces of every period, a power of two; all periods of the windows.
         windows: numbers of the control, ``(K, g)``.
-        fraction: in [0, 1).
+        step: whole periods that pass, at most K.
+        fraction: of the period after them, in [0, 1).
+        parts: that a period is followed in at least, a power of two.
 
     Raises:
-        Unproved: no box was found that the solution stays in, or it is too wide.
+        Unproved: no box was found that the solution stays in, or it is too wide; or a signal that does not fit.
     """
+    pieces, rest = divmod(len(signal), len(windows))
+    if rest or pieces < 1 or pieces > MOST_PIECES or pieces & (pieces - 1):
+        raise Unproved(
+            f"its signal has {len(signal)} pieces, in {len(windows)} periods; a power of two is needed in each"
+        )
+    parts = max(parts, pieces)
     try:
-        follower = _Follower(ode)
+        follower = _Follower(ode, parts)
     except ValueError as e:
         raise Unproved(str(e)) from None
     x = list(start)
-    for k, w in enumerate(signal):
+    for k in range(step + (fraction > 0)):
         numbers = []
         if ode.controls:
-            inputs = {"state": x, "disturbance": w, "numbers": balls(windows[k])}
+            inputs = {"state": x, "disturbance": signal[k * pieces], "numbers": balls(windows[k])}
             numbers = [(u.lower(), u.upper()) for u in outputs_at(control, inputs)["control"]]
-        whole = k < len(signal) - 1 or not fraction
         box = [(v.lower(), v.upper()) for v in x]
-        passed = PARTS if whole else int(fraction * PARTS)  # exact: a multiple by a power of two
-        for _ in range(passed):
+        share = fraction if k == step else 1.0
+        passed = int(share * parts)  # exact: a multiple by a power of two
+        for i in range(passed):
+            w = signal[k * pieces + i * pieces // parts]
             box = follower.after(box, numbers, points(w), follower.length)
-        if not whole:
-            rest = ball(fraction) * follower.length * PARTS - follower.length * passed
-            box = follower.after(box, numbers, points(w), rest)
+        if passed < share * parts:
+            w = signal[k * pieces + passed * pieces // parts]
+            box = follower.after(box, numbers, points(w), (ball(share) * parts - passed) * follower.length)
         x = [low.union(high) for low, high in box]
         if not all(v.is_finite() for v in x):
             raise Unproved(f"its solution cannot be followed through period {k}: the box around it becomes too wide")
@@ -66,9 +80,9 @@ def followed(
 
 
 class _Follower:
-    """Steps of at most ``length`` seconds."""
+    """Steps of at most ``length`` seconds, so many to a period."""
 
-    def __init__(self, ode: Flow) -> None:
+    def __init__(self, ode: Flow, parts: int) -> None:
         n = ode.rate.states
         out = Writer(n, n, ode.rate.numbers)
         c = solution(out, ode.rate, out.state, out.numbers, out.disturbance, ORDER + 1)
@@ -78,7 +92,7 @@ class _Follower:
         )  # fmt: skip
         self._n, self._rate = n, Bounds(ode.rate, ode.rate.next)
         self._coefficients = Bounds(made, made.control)
-        self.length = ball(ode.length) * ode.substeps / PARTS
+        self.length = ball(ode.length) * ode.substeps / parts
 
     def after(self, box: Column, numbers: Column, w: Column, time: arb) -> Column:
         """A box around the state some time later, at most a step."""

@@ -36,22 +36,26 @@ class Expansion:
         rate: the program; it may not read its disturbance.
         state: coefficients of the state, to which others may be added between calls of :meth:`order`.
         control: the value of its numbers, which are constant in time; None if it has none.
+        output: the slot whose coefficients are asked for; ``next`` by default.
 
     Raises:
         ValueError: an instruction that is not smooth, or the disturbance.
     """
 
-    def __init__(self, out: Writer, rate: Program, state: Series, control: Value) -> None:
+    def __init__(
+        self, out: Writer, rate: Program, state: Series, control: Value, output: int | None = None
+    ) -> None:  # fmt: skip
         require_smooth(rate)
         self.out, self.rate, self.state, self.control = out, rate, state, control
+        self._output = rate.next if output is None else output
         self._of: list[Series] = [[] for _ in rate.widths]
         self._with: dict[tuple[int, str], Series] = {}
 
     def order(self, q: int) -> Value:
-        """Coefficient q of the output ``next``; all before have to be there."""
+        """Coefficient q of the output; all before have to be there."""
         for slot, instruction in enumerate(self.rate.instructions):
             self._of[slot].append(self._coefficient(slot, instruction, q))
-        return self._of[self.rate.next][q]
+        return self._of[self._output][q]
 
     def _coefficient(self, slot: int, i: Instruction, q: int) -> Value:
         kind = i.kind

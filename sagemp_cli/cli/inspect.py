@@ -126,7 +126,7 @@ def _fields(record: Any, prefix: str) -> list[dict[str, str]]:
                 count = sum(int(np.size(w)) for w in (value or {}).values())
                 row["holds"] = "-" if value is None else f"{len(value)} arrays, {count} numbers"
             case "group" if meta["many"]:
-                row["holds"] = f"{len(value)} groups"
+                row["holds"] = "-" if value is None else f"{len(value)} groups"
         rows.append(row)
         if meta["form"] == "weights":
             rows += [

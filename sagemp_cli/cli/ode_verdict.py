@@ -41,7 +41,7 @@ def ode_as_data(proof: OdeProof) -> dict[str, Any]:
             "at": example.time,
             "depth": example.depth,
             "start": example.start.tolist(),
-            "disturbance": example.disturbance.tolist(),
+            "signal": example.signal.tolist(),
             "proved": example.proved,
         },
         "notes": list(proof.notes),
@@ -73,7 +73,7 @@ def ode_as_lines(data: dict[str, Any]) -> list[str]:
                 f"which no enclosure proves: it may be rounding"
             )
     lines += [f"  {note}" for note in data["notes"]]
-    lines += ["no certificate is written of a proof in continuous time yet", f"figure      {data['figure']}"]
+    lines += [f"certificate {data['certificate']}", f"figure      {data['figure']}"]
     return lines
 
 

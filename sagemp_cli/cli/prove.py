@@ -124,7 +124,7 @@ def prove(
 
     An object or a class with [bold]rate(x, u)[/bold] and [bold]control(x)[/bold] is a robot as an ODE whose control is
     held for a period: what is proved holds at all times, between the samples too. It may say its period, horizon,
-    start, disturbance, state_names and requirements itself. No certificate is written of it, only the figure.
+    start, disturbance, state_names and requirements itself.
     """
     import torch
 
@@ -156,8 +156,8 @@ def prove(
     }
     of_ode = {"network": network, "period": period, "substeps": substeps, "order": order}
     if is_plant(step):
-        of_steps = {"dt": dt, "output": output, "between": None if between == "segments" else between}
-        _refuse(of_steps, f"{target} is an ODE, judged at all times, and no certificate is written yet")
+        of_steps = {"dt": dt, "between": None if between == "segments" else between}
+        _refuse(of_steps, f"{target} is an ODE, judged at all times")
         with limited(time_limit):
             found = prove_ode(
                 plant_of(step, network),
@@ -167,9 +167,11 @@ def prove(
                 period=period,
                 substeps=substeps,
                 order=order,
+                certificate=path,
+                overwrite=overwrite,
                 figure=path.with_suffix(".png"),
             )
-        said = ode_as_data(found) | {"figure": str(path.with_suffix(".png"))}
+        said = ode_as_data(found) | {"certificate": str(path), "figure": str(path.with_suffix(".png"))}
         typer.echo(json.dumps(said, indent=2) if as_json else printable("\n".join(ode_as_lines(said))))
         raise typer.Exit(ANSWER_CODES[str(found.answer)])
     _refuse(of_ode, f"{target} is a step, no ODE: it has no rate(x, u)")

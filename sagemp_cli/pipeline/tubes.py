@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,34 +48,47 @@ def tubes_record(v: Verification) -> Tubes:
         between=str(v.between),
         parts=1 if v.between is Between.SAMPLES else PARTS,
         relaxations=None if v.recording is None else relaxations_record(v.recording),
-        flow=None if v.flow is None else flow_record(v.flow),
+        flow=None if v.flow is None else flow_record([v.flow]),
     )
 
 
-def flow_of(record: FlowBounds, tube: Tube) -> Flow:
-    """What is stored of the time between the instants, with the tube ``(C, K+1, n)`` at them."""
-    ends = [
-        torch.cat([side[:, :-1, None], torch.from_numpy(inner)], 2)
-        for side, inner in ((tube.lower, record.inner_lower), (tube.upper, record.inner_upper))
-    ]
-    sides = (record.lower, record.upper, record.remainder_lower, record.remainder_upper, record.curve, record.drift)
-    return Flow(Division(record.substeps, record.order), *ends, *map(torch.from_numpy, sides))
+def flows_of(record: FlowBounds, tube: Tube) -> list[tuple[np.ndarray, Flow]]:
+    """What is stored of the time between the instants, with the tube ``(C, K+1, n)`` at them: of all cells that are
+    divided alike their indices and their flow."""
+    found = []
+    for substeps, order in sorted(set(zip(record.substeps.tolist(), record.order.tolist(), strict=True))):
+        own = np.flatnonzero((record.substeps == substeps) & (record.order == order))
+        ends = [
+            torch.cat([side[own][:, :-1, None], torch.from_numpy(inner[own][:, :, : substeps - 1])], 2)
+            for side, inner in ((tube.lower, record.inner_lower), (tube.upper, record.inner_upper))
+        ]
+        sides = (record.lower, record.upper, record.remainder_lower, record.remainder_upper, record.curve, record.drift)
+        parts = [torch.from_numpy(side[own][:, :, :substeps]) for side in sides]
+        found.append((own, Flow(Division(substeps, order), *ends, *parts)))
+    return found
 
 
-def flow_record(flow: Flow) -> FlowBounds:
-    """What was proved within periods, as stored; the states at their beginning are those of the tube."""
+def flow_record(flows: Sequence[Flow]) -> FlowBounds:
+    """What was proved within periods, of the cells of one flow after the other, as stored; the states at the beginning
+    of periods are those of the tube."""
+    most = max(flow.division.substeps for flow in flows)
+
+    def every(side: str, first: int = 0) -> np.ndarray:
+        parts = [getattr(flow, side)[:, :, first:] for flow in flows]
+        padded = [torch.nn.functional.pad(p, (0, 0, 0, most - first - p.shape[2])) for p in parts]
+        return torch.cat(padded).numpy()
+
+    cells = [len(flow.lower) for flow in flows]
     return FlowBounds(
-        substeps=flow.division.substeps,
-        order=flow.division.order,
-        inner_lower=flow.state_lower[:, :, 1:].numpy(),
-        inner_upper=flow.state_upper[:, :, 1:].numpy(),
-        lower=flow.lower.numpy(),
-        upper=flow.upper.numpy(),
-        remainder_lower=flow.remainder_lower.numpy(),
-        remainder_upper=flow.remainder_upper.numpy(),
-        curve=flow.curve.numpy(),
-        drift=flow.drift.numpy(),
-    )
+        substeps=np.repeat([flow.division.substeps for flow in flows], cells),
+        order=np.repeat([flow.division.order for flow in flows], cells),
+        inner_lower=every("state_lower", 1),
+        inner_upper=every("state_upper", 1),
+        **{
+            side: every(side)
+            for side in ("lower", "upper", "remainder_lower", "remainder_upper", "curve", "drift")
+        },
+    )  # fmt: skip
 
 
 def relaxations_record(recording: Recording) -> Relaxations:

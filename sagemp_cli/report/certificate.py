@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.pipeline.problem import problem_of
-from sagemp_cli.pipeline.tubes import flow_of
+from sagemp_cli.pipeline.tubes import flows_of
 from sagemp_cli.problem import Problem
 from sagemp_cli.report.canvas import (
     DANGER,
@@ -166,7 +166,8 @@ def _clearances(axes: Axes, times: np.ndarray, problem: Problem, tubes: Tubes) -
     tube = Tube(torch.from_numpy(tubes.tube_lower), torch.from_numpy(tubes.tube_upper))
     lines, bulge, steps = tube, None, tube.horizon
     if tubes.flow is not None:
-        lines, bulge = flow_of(tubes.flow, tube).lines(tube, problem.disturbance, problem.dynamics.dt)
+        ((_, flow),) = flows_of(tubes.flow, tube)  # all cells are divided alike
+        lines, bulge = flow.lines(tube, problem.disturbance, problem.dynamics.dt)
         bulge = Bulge(*(part[..., index] for part in (bulge.curve, bulge.swing, bulge.rest)))
     lower = torch.nan_to_num(lines.lower[..., index], nan=-torch.inf, posinf=-torch.inf)
     upper = torch.nan_to_num(lines.upper[..., index], nan=torch.inf, neginf=torch.inf)

@@ -112,8 +112,8 @@ def prove(
         "name": name,
         "horizon": seen.loop.horizon,
         "seed": seed,
-        "start": _corners(seen.start),
-        "disturbance": _corners(seen.disturbance),
+        "start": corners(seen.start),
+        "disturbance": corners(seen.disturbance),
         **({"scene": problem} if problem else {}),
     }
     found, decided = proof.counterexample, proof.verification.verdicts[0].constraint
@@ -159,7 +159,7 @@ def scene_data(given: Mapping[str, Any] | None, goal: Box | None) -> dict[str, A
     if goal is not None:
         if "goal" in scene:
             raise UsageError("the scene has a goal, and another one is given beside it; give one of them")
-        scene["goal"] = _corners(goal)
+        scene["goal"] = corners(goal)
     return scene if scene.keys() & {"workspace", "obstacles", "goal"} else {}
 
 
@@ -200,5 +200,6 @@ def _state(given: int | str, names: Sequence[str]) -> int:
     return number
 
 
-def _corners(box: Box) -> dict[str, list[float]]:
+def corners(box: Box) -> dict[str, list[float]]:
+    """A box as plain data."""
     return {"lower": box.lower.tolist(), "upper": box.upper.tolist()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 
 from sagemp_cli.errors import ArtifactError, UsageError
 from sagemp_cli.loop.onnx_format.lowering import read_network
+from sagemp_cli.pipeline.ode_record import ode_certificate
 from sagemp_cli.reachability.any_loop import counts_of, propagator_of
 from sagemp_cli.reachability.continuous.observed import observed_ode
 from sagemp_cli.reachability.propagator import Propagator
@@ -20,7 +22,8 @@ from sagemp_cli.report.ode import draw_ode
 from sagemp_cli.scenes.requirements import Inside, Requirement, of_scene
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.between import Between
-from sagemp_cli.stages.prove import claim_of, scene_data
+from sagemp_cli.stages.prove import claim_of, corners, scene_data
+from sagemp_cli.storage import Header, refuse_existing, write_artifact
 from sagemp_cli.verification.continuous.proof import OdeProof, verify_ode
 
 Pairs = Sequence[tuple[float, float]]
@@ -144,6 +147,8 @@ def prove_ode(
     order: int | None = None,
     restarts: int = 1,
     seed: int = 0,
+    certificate: Path | str | None = None,
+    overwrite: bool = False,
     figure: Path | str | None = None,
     name: str = "loop",
 ) -> OdeProof:
@@ -167,13 +172,19 @@ def prove_ode(
         substeps, order: how a period is cut and expanded; as fine as the proof needs by default.
         restarts: 0 for no attack.
         seed: of the attack.
+        certificate: file to write; None writes nothing.
+        overwrite: replace it if it is there.
         figure: file to draw; None draws nothing.
-        name: what the loop is called in it.
+        name: what the loop is called in both.
 
     Raises:
         UsageError: an argument that does not fit, or functions that are not functions of their arguments.
+        ArtifactError: the file is there already.
         UnsupportedOperationError: an operation that cannot be bounded.
     """
+    began, path = time.monotonic(), None if certificate is None else Path(certificate)
+    if path is not None:
+        refuse_existing(path, overwrite)
     start = plant.start if start is None else start
     if start is None:
         raise UsageError("no start box is given: --start")
@@ -210,6 +221,17 @@ def prove_ode(
         restarts=restarts,
         generator=torch.Generator().manual_seed(seed),
     )
+    if path is not None:
+        config = {
+            "name": name,
+            "horizon": seen.loop.horizon,
+            "seed": seed,
+            "start": corners(seen.start),
+            "disturbance": corners(seen.disturbance),
+        }
+        header = Header(stage="prove", experiment=name, config=config, seed=seed, seconds=time.monotonic() - began)
+        record = ode_certificate(proof, state_names=names, state_units=units)
+        write_artifact(path, record, header, overwrite=overwrite)
     if figure is not None:
         save_figure(draw_ode(proof, name, names, units, _limits(asked, names)), Path(figure))
     return proof

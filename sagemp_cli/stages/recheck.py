@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sagemp_cli.config.folders import load_scene
 from sagemp_cli.errors import UsageError
 from sagemp_cli.library.builder import REASON_OF, REASONS
-from sagemp_cli.pipeline.tubes import flow_of, selected
+from sagemp_cli.pipeline.tubes import flows_of, selected
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Between, Box, Bulge, Tube
 from sagemp_cli.storage import (
@@ -73,6 +73,8 @@ def recheck(path: Path, scene: str, *, output: Path | None = None, overwrite: bo
     _, artifact = read_any_artifact(path)
     if not isinstance(artifact.record, Certificate | Library):
         raise UsageError(f"{path}: tubes are in certificates and libraries, this is neither")
+    if isinstance(artifact.record, Certificate) and artifact.record.requirements is not None:
+        raise UsageError(f"{path}: is about requirements of an ODE of one's own, not about a scene; prove it again")
     if not artifact.unchanged:
         raise UsageError(f"{path}: the content was changed after it was written (its hash differs)")
     tubes, loop, content = artifact.record.tubes, artifact.record.loop, load_scene(scene)
@@ -112,7 +114,8 @@ def _lines(tubes: Tubes, loop: LoopRecord) -> tuple[Tube, tuple[Tube, Bulge] | N
     if tubes.flow is None or loop.dt is None:
         return tube, None
     w = Box(torch.from_numpy(tubes.disturbance_lower), torch.from_numpy(tubes.disturbance_upper))
-    return tube, flow_of(tubes.flow, tube).lines(tube, w, loop.dt)
+    ((_, flow),) = flows_of(tubes.flow, tube)  # the cells of robots of ours are divided alike
+    return tube, flow.lines(tube, w, loop.dt)
 
 
 def _clear(tubes: Tubes, loop: LoopRecord, scene: Scene) -> tuple[NDArray[np.bool_], float]:

@@ -140,10 +140,13 @@ class Relaxations:
 
 @dataclass(frozen=True, kw_only=True)
 class FlowBounds:
-    """What is proved of a loop in continuous time within its periods (see ``docs/continuous_time.md``)."""
+    """What is proved of a loop in continuous time within its periods (see ``docs/continuous_time.md``).
 
-    substeps: int = scalar("equal parts that a period is cut into, S")
-    order: int = scalar("degree of the Taylor polynomials, p")
+    A cell has a division of its own; S is the most parts that any has, and the rest of the others is 0.
+    """
+
+    substeps: np.ndarray = array("cells", "equal parts that a period is cut into", dtype="int64")
+    order: np.ndarray = array("cells", "degree of the Taylor polynomials, p", dtype="int64")
     inner_lower: np.ndarray = array(
         "cells K S-1 n", "lower bounds of the states where parts 2 to S of a period begin", finite=False
     )
@@ -190,15 +193,14 @@ class Tubes:
     tube_upper: np.ndarray = array("cells K+1 n", "upper bounds of the reach set of each cell and step", finite=False)
     control_lower: np.ndarray = array("count K m", "lower bounds of the controls over all cells", finite=False)
     control_upper: np.ndarray = array("count K m", "upper bounds of the controls over all cells", finite=False)
-    verdict: tuple[str, ...] = texts("count", "SAFE, MAY_COLLIDE, MISSES_GOAL, UNBOUNDED or UNSAFE")
+    verdict: tuple[str, ...] = texts("count", "SAFE, MAY_COLLIDE, MISSES_GOAL, MAY_VIOLATE, UNBOUNDED or UNSAFE")
     step: np.ndarray = array("count", "step that decided the verdict (-1: none, SAFE)", dtype="int64")
     fraction: np.ndarray = array("count", "part of that step that was over when it was decided, 0 or more, below 1")
     constraint: tuple[str, ...] = texts("count", "obstacle, workspace or goal dimension that decided ('' if SAFE)")
     constraint_names: tuple[str, ...] = texts("constraints", "names of the constraints of 'clearance'")
     clearance: np.ndarray = array(
         "count constraints",
-        "smallest certified distance to each constraint over all of the time",
-        units="m",
+        "smallest certified distance to each constraint over all of the time (m), or margin of each requirement",
         finite=False,
     )
     goal_margin: np.ndarray = array(
@@ -219,17 +221,31 @@ class Tubes:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RequirementRecord:
+    """What has to hold of the state at all times of an interval (see ``docs/certificates.md``)."""
+
+    name: str = scalar("what it is called; said, not proved")
+    margins: ProgramRecord = group(ProgramRecord, "of the state: its output 'control' must not be negative")
+    every: bool = scalar("whether all margins must hold, or at each time one of them at least")
+    strict: bool = scalar("whether a margin must be above 0, or 0 will do")
+    first: float = scalar("when it has to hold from on, in periods, 0 to K")
+    last: float = scalar("up to when, included, likewise")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Counterexample:
     """A replayed rollout that violates the claim."""
 
     reference: int = scalar("index of the reference")
-    kind: str = scalar("'collision', 'workspace' or 'goal'")
+    kind: str = scalar("'collision', 'workspace', 'goal' or 'requirement'")
     step: int = scalar("step of the violation")
     fraction: float = scalar("part of that step that is over at the violation, 0 or more, below 1")
-    constraint: str = scalar("obstacle, 'workspace' or goal dimension")
+    constraint: str = scalar("obstacle, 'workspace', goal dimension or requirement")
     depth: float = scalar("depth of the violation (> 0)")
     states: np.ndarray = array("K+1 n", "replayed states")
-    disturbances: np.ndarray = array("K d", "disturbances")
+    disturbances: np.ndarray = array(
+        "signal d", "disturbances of all steps, in continuous time of equally many equal pieces of each period"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,6 +279,9 @@ class Certificate:
     verdict: str = scalar("VERIFIED, FALSIFIED or UNKNOWN for all references together")
     true_model: TrueModel | None = group(
         TrueModel, "of a learned robot: what holds of its analytical model", optional=True
+    )
+    requirements: tuple[RequirementRecord, ...] | None = group(
+        RequirementRecord, "of a loop in continuous time, what has to hold beside a scene", many=True, optional=True
     )
     samples: Samples | None = group(
         Samples, "further plans, if any were drawn: said by whoever made the file, not proved", optional=True
@@ -361,8 +380,8 @@ KINDS = (
     Kind("dynamics", 1, DynamicsModel),
     Kind("planner", 1, PlannerModel),
     Kind("tracker", 1, TrackerModel),
-    Kind("certificate", 3, Certificate, oldest=3, command="sagemp verify --overwrite"),
-    Kind("library", 3, Library, oldest=3, command="sagemp build-library --overwrite"),
+    Kind("certificate", 4, Certificate, oldest=4, command="sagemp verify --overwrite"),
+    Kind("library", 4, Library, oldest=4, command="sagemp build-library --overwrite"),
     Kind("rollouts", 2, Rollouts, oldest=2, command="sagemp execute --overwrite"),
     Kind("safety", 2, SafetyRates, oldest=2, command="sagemp safety-rates --overwrite"),
 )

@@ -28,6 +28,8 @@ class Outcome(StrEnum):
     """The tube touches an obstacle or the workspace's boundary."""
     MISSES_GOAL = "MISSES_GOAL"
     """The tube keeps clear, but at step K it is not inside the goal."""
+    MAY_VIOLATE = "MAY_VIOLATE"
+    """In continuous time: a requirement is not proved of the flow."""
     UNBOUNDED = "UNBOUNDED"
     """The tube overflowed; nothing is proved from there on."""
     UNSAFE = "UNSAFE"

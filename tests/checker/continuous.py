@@ -116,7 +116,7 @@ def flow_case(path: Path, *, horizon: int = 4, substeps: int = 2, order: int = 2
         between="continuous",
         parts=8,
         relaxations=relaxations_record(reach.recording),
-        flow=flow_record(reach.flow),
+        flow=flow_record([reach.flow]),
     )
     certificate = Certificate(
         tubes=tubes,

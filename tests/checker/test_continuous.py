@@ -120,7 +120,8 @@ def test_no_switching_signal_leaves_what_is_proved_at_any_time(case):
     """Solutions by a fine Runge-Kutta method, w switching at up to 16 times the rate of the parts."""
     fine, slack, flow, tubes = 32, 1e-9, case.certificate.tubes.flow, case.certificate.tubes
     rng, w, loop = np.random.default_rng(0), case.disturbance, case.loop
-    steps, per = loop.horizon * fine, fine // flow.substeps
+    parts = int(flow.substeps[0])
+    steps, per = loop.horizon * fine, fine // parts
     for c in range(2):
         low, high = case.cells.lower[c], case.cells.upper[c]
         count = 400
@@ -143,7 +144,7 @@ def test_no_switching_signal_leaves_what_is_proved_at_any_time(case):
         states = torch.stack(states, 1).numpy()
         at = states[:, ::fine]
         assert ((tubes.tube_lower[c] - slack <= at) & (at <= tubes.tube_upper[c] + slack)).all()
-        pieces = states[:, :-1].reshape(count, loop.horizon, flow.substeps, per, 3)
+        pieces = states[:, :-1].reshape(count, loop.horizon, parts, per, 3)
         assert (flow.lower[c][:, :, None] - slack <= pieces).all() and (
             pieces <= flow.upper[c][:, :, None] + slack
         ).all()
@@ -152,9 +153,9 @@ def test_no_switching_signal_leaves_what_is_proved_at_any_time(case):
         s = np.arange(per)[:, None] / per
         ends = states[:, ::per]
         first, last = (
-            side.reshape(count, loop.horizon, flow.substeps, 1, 3) for side in (ends[:, :-1], ends[:, 1:])
+            side.reshape(count, loop.horizon, parts, 1, 3) for side in (ends[:, :-1], ends[:, 1:])
         )  # fmt: skip
-        swing = loop.period / flow.substeps * (w.upper - w.lower).numpy()
+        swing = loop.period / parts * (w.upper - w.lower).numpy()
         bulge = s * (1 - s) * (flow.curve[c][:, :, None] + swing) + 2 * flow.drift[c][:, :, None]
         assert (np.abs(pieces - first - s * (last - first)) <= bulge + slack).all()
 
@@ -189,7 +190,7 @@ def test_no_switching_signal_leaves_the_checkers_own_sets(case, path):
     """Those are what it proves with; the stored ones have to contain them."""
     document, fine, slack = read_document(path), 32, 1e-9
     rng, w, loop = np.random.default_rng(5), case.disturbance, case.loop
-    steps, per, m = loop.horizon * fine, fine // case.certificate.tubes.flow.substeps, 1
+    steps, per, m = loop.horizon * fine, fine // int(case.certificate.tubes.flow.substeps[0]), 1
     for c in range(2):
         at, inner = own_sets(document, c)
         low, high = case.cells.lower[c], case.cells.upper[c]
@@ -312,6 +313,13 @@ def attribute(where, **values):
     return lambda file: file[where].attrs.update(values)
 
 
+def divided(name, values):
+    def change(file):
+        file[f"data/tubes/flow/{name}"][...] = values
+
+    return change
+
+
 def without(name):
     return lambda file: file.__delitem__(name)
 
@@ -330,8 +338,11 @@ def kinked(file):
         (attribute("data/tubes", between="segments"), "needs 'between: continuous'"),
         (without("data/tubes/flow"), "needs 'between: continuous'"),
         (without(RATE), "needs 'between: continuous'"),
-        (attribute("data/tubes/flow", substeps=4), "must be float64 of shape"),
-        (attribute("data/tubes/flow", order=0), "the order is 0"),
+        (divided("substeps", [4, 4]), "must be float64 of shape"),
+        (divided("substeps", [2, 1]), "of parts that a cell does not have"),
+        (divided("substeps", [2, 0]), "of parts that a cell does not have"),
+        (divided("order", [2, 0]), "the order is 0"),
+        (divided("order", [2, -1]), "the order is -1"),
         (attribute("data/loop", dt=0.0), "the period is 0"),
         (lambda file: file["data/loop"].attrs.__delitem__("dt"), "needs dt"),
         (kinked, "'relu' stands in the right-hand side of the ODE"),

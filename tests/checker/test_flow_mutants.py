@@ -67,13 +67,14 @@ def solutions(document: Document, rng: np.random.Generator, count: int = 48) -> 
     tubes, ode, (control,) = document.tubes, document.ode, document.programs
     steps, h, found = document.horizon * FINE, document.dt / FINE, []
     low, high = tubes["disturbance_lower"], tubes["disturbance_upper"]
-    nothing = np.zeros((count, 3))
+    n = len(low)
+    nothing = np.zeros((count, n))
     for lower, upper in zip(tubes["cell_lower"], tubes["cell_upper"], strict=True):
-        x = rng.uniform(size=(count, 3))
+        x = rng.uniform(size=(count, n))
         x[: count // 2] = x[: count // 2].round()
         x = lower + x * (upper - lower)
         switches = rng.choice([steps, FINE, FINE // S, 4, 1], count)
-        signal = np.stack([np.repeat(rng.integers(0, 2, (steps, 3)), every, axis=0)[:steps] for every in switches])
+        signal = np.stack([np.repeat(rng.integers(0, 2, (steps, n)), every, axis=0)[:steps] for every in switches])
         w, states = low + signal * (high - low), [x]
         with np.errstate(all="ignore"):
             for i in range(steps):
@@ -94,7 +95,7 @@ def solutions(document: Document, rng: np.random.Generator, count: int = 48) -> 
 
 def output_of(control: Program, x: np.ndarray) -> np.ndarray:
     made = dataclasses.replace(control, next=control.control)
-    return run(made, x, np.zeros((len(x), 3)))
+    return run(made, x, np.zeros((len(x), control.disturbances)))
 
 
 def require_true(document: Document, states: list[np.ndarray]) -> None:
@@ -156,7 +157,7 @@ def ode_with(document: Document, **changes: Any) -> Mutant:
         ode = flow_of(given["control"], given["rate"], **{n: given[n] for n in ("period", "substeps", "order")})
     except ValueError:
         return None
-    made = dataclasses.replace(document, ode=ode, programs=(given["control"],), dt=given["period"])
+    made = dataclasses.replace(document, odes=(ode,), programs=(given["control"],), dt=given["period"])
     return made if ode.step.relaxations == document.relaxations["slope"].shape[-1] else None
 
 

@@ -56,13 +56,19 @@ def test_a_robot_that_says_all_of_it_is_proved_with_one_argument(sagemp, robots,
     assert data["verdict"] == "VERIFIED" and data["time"] == "continuous"
     assert data["requirements"][0]["margin"] > 0
     assert (tmp_path / data["figure"]).read_bytes().startswith(b"\x89PNG")
+    checked = sagemp("check", data["certificate"])
+    assert checked.exit_code == 0, checked.output
+    assert "requirement inside  at all these times: angle -0.5 to 0.5" in checked.stdout
+    again = sagemp("prove", f"{robots}:Robot")
+    assert again.exit_code == 2 and "--overwrite" in again.stderr
 
 
 def test_a_goal_that_is_missed_is_falsified_and_said_so(sagemp, robots):
-    said = sagemp("prove", f"{robots}:Robot", "--goal", "0:0.001,:")
+    said = sagemp("prove", f"{robots}:Robot", "--goal", "0:0.001,:", "--output", "missed.h5")
     assert said.exit_code == 10, said.stderr
     assert "FALSIFIED" in said.stdout and "an enclosure of it proves it" in said.stdout
-    assert "no certificate is written" in said.stdout
+    checked = sagemp("check", "missed.h5")
+    assert checked.exit_code == 10 and "its counterexample is proved" in checked.stdout
 
 
 @pytest.mark.parametrize(

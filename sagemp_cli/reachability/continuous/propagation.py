@@ -107,7 +107,8 @@ class _Block:
 def propagated(
     affine: Affine, loop: SampledLoop, start: Box, w: Box, division: Division, *, foresee: bool = False
 ) -> FlowRun:
-    """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
+    """Reach sets of cells ``(C, n)`` under signals in ``w (n,)``, or in each period in a box of its own, ``(K, n)``, or
+    in each part of one, ``(K, S, n)``.
 
     Rows of the tube after a period in which no enclosure was found are infinite. What halving the cells would do is
     followed if it is to be foreseen; of remainders it knows nothing.
@@ -182,7 +183,10 @@ def _attempt(
     cells, n = start.lower.shape
     s, steps = programs.division.substeps, part.horizon
     guess = guess.expand(2, steps, cells, s, n)
-    signal = [side.expand(steps, n)[:, None, None].expand(steps, cells, s, n) for side in (w.lower, w.upper)]
+    signal = [
+        (side if side.dim() == 3 else side.expand(steps, n)[:, None])[:, None].expand(steps, cells, s, n)
+        for side in (w.lower, w.upper)
+    ]
     sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
     run = affine.run(part, start, Box(*sides), watch=True, states=begin.states, intervals=False, halving=begin.halving)
     state, control = _boxes(run, n, s)

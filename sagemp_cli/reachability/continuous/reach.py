@@ -39,7 +39,7 @@ def reach_continuously(
     foresee: bool = False,
 ) -> Reach:
     """Enclosures at the instants and between them, of every solution from ``start (C, n)`` under every measurable
-    signal in ``w (n,)``, or in each period in a box of its own, ``(K, n)``.
+    signal in ``w (n,)``, or in each period in a box of its own, ``(K, n)``, or in each part of one, ``(K, S, n)``.
 
     Args:
         propagator: bounds the steps; ``affine``.
@@ -60,7 +60,11 @@ def reach_continuously(
         )
     known = sampled(loop, start)
     n, order = known.state_dim, ORDER if order is None else order
-    if start.lower.dim() != 2 or start.dim != n or w.lower.shape not in ((n,), (known.horizon, n)):
+    if (
+        start.lower.dim() != 2
+        or start.dim != n
+        or w.lower.shape not in ((n,), (known.horizon, n), (known.horizon, substeps, n))
+    ):
         raise UsageError(
             f"the start boxes must be (C, {n}) and the disturbance ({n},), found {tuple(start.lower.shape)} and "
             f"{tuple(w.lower.shape)}: in continuous time w is added to the rate of every state"

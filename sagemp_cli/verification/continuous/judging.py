@@ -1,7 +1,8 @@
 """What a flow proves of requirements, at all times that they speak of.
 
 Time is cut at the ends of all parts of all periods. A requirement is checked at the ends that its interval holds and
-over every part that it touches; a time within a millionth of a part from an end means that end.
+over every part that it touches. Its times are read in periods: one within a millionth of a period of a sample means
+that sample.
 """
 
 from __future__ import annotations
@@ -21,15 +22,23 @@ from sagemp_cli.scenes.requirements import Formula
 from sagemp_cli.sets import Box, Tube
 
 _NEAR = 1e-6
-"""Share of a part by which a time may differ from an end that it means."""
+"""Share of a period by which a time may differ from a sample that it means."""
 
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """A formula with its margins as programs."""
+    """A formula with its margins as programs.
+
+    Attributes:
+        formula: it.
+        margins: as programs.
+        first, last: when it has to hold, both included, in periods.
+    """
 
     formula: Formula
     margins: Observable
+    first: float
+    last: float
 
     @staticmethod
     def of(formula: Formula, loop: SampledLoop, example: Tensor) -> Asked:
@@ -46,13 +55,15 @@ class Asked:
                 f"requirement '{formula.name}' speaks of {last:g} s, the horizon ends at {end:g} s: "
                 f"{loop.horizon} periods of {loop.period:g} s"
             )
-        return Asked(formula, observable(formula.margins, loop, example, formula.name))
+        margins = observable(formula.margins, loop, example, formula.name)
+        first, last = (min(_snapped(t / loop.period), float(loop.horizon)) for t in (formula.first, formula.last))
+        return Asked(formula, margins, first, last)
 
     def times(self, loop: SampledLoop, substeps: int) -> tuple[Tensor, Tensor]:
-        """Which ends of parts ``(K S + 1,)`` and which parts ``(K S,)`` it speaks of."""
-        count, h = loop.horizon * substeps, loop.period / substeps
-        first, last = (_snapped(min(t / h, count)) for t in (self.formula.first, self.formula.last))
-        ends = torch.arange(count + 1, dtype=torch.float64)
+        """Which ends of parts ``(K S + 1,)`` and which parts ``(K S,)`` it speaks of; exact, since S is a power of
+        two."""
+        first, last = self.first * substeps, self.last * substeps
+        ends = torch.arange(loop.horizon * substeps + 1, dtype=torch.float64)
         return (first <= ends) & (ends <= last), (first < ends[1:]) & (ends[:-1] < last)
 
     def worst(self, margins: Tensor) -> Tensor:
@@ -61,7 +72,7 @@ class Asked:
 
 
 def _snapped(place: float) -> float:
-    return float(round(place)) if abs(place - round(place)) < _NEAR else place
+    return float(round(place)) if math.isfinite(place) and abs(place - round(place)) < _NEAR else place
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ least together.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from sagemp_cli.errors import UsageError
 from sagemp_cli.reachability.any_loop import cells_of
 from sagemp_cli.reachability.continuous.division import ENOUGH, FINE, finer, remainder_share, suggested
 from sagemp_cli.reachability.continuous.observed import ObservedOde
@@ -27,10 +29,13 @@ from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.scenes.requirements import Formula
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import halved
-from sagemp_cli.verification.continuous.attack import Violation, search
+from sagemp_cli.verification.continuous.attack import Found, Violation, search
 from sagemp_cli.verification.continuous.judging import Asked, Judgement, foreseen_missing, judged
 from sagemp_cli.verification.cutting import best_cut
 from sagemp_cli.verification.verdict import Answer
+
+LONGEST_NAME = 50
+"""Characters of a requirement's name."""
 
 _PATIENCE = 3
 """Halvings in a row that may be in vain, before the rest is given up."""
@@ -97,11 +102,12 @@ class OdeProof:
     Attributes:
         loop: the recorded programs that it is about.
         start, disturbance: X_I and W.
-        requirements: what was asked.
+        requirements: what was asked, as programs.
         pieces: all cells; together they cover X_I.
         verdicts: one for each requirement.
         bounded: whether all states were bounded up to the end.
         violation: a solution that breaks a requirement, if one was found.
+        rollouts: so many were simulated in looking for one.
         seconds: of processor time.
         notes: of the propagator.
         propagator: its name.
@@ -110,11 +116,12 @@ class OdeProof:
     loop: SampledLoop
     start: Box
     disturbance: Box
-    requirements: tuple[Formula, ...]
+    requirements: tuple[Asked, ...]
     pieces: tuple[Piece, ...]
     verdicts: tuple[RequirementVerdict, ...]
     bounded: bool
     violation: Violation | None
+    rollouts: int
     seconds: float
     notes: tuple[str, ...]
     propagator: str
@@ -188,12 +195,12 @@ def verify_ode(
     example = seen.start.center
     formulas = _named(formulas)
     asked = [Asked.of(f, seen.loop, example) for f in formulas]
-    violation = None
+    found = Found(None, 0)
     if restarts:
-        violation = search(seen.loop, seen.start, seen.disturbance, asked, generator=generator, ascents=False)
+        found = search(seen.loop, seen.start, seen.disturbance, asked, generator=generator, ascents=False)
+    violation, rollouts = found.violation, found.rollouts
     if violation is not None and violation.proved:
-        spent = time.process_time() - began
-        return _refuted(seen, asked, violation, propagator, spent)
+        return _refuted(seen, asked, found, propagator, time.process_time() - began)
     work = _Work(seen, propagator, asked, cells_at_once, substeps, order)
     cells = cells_of(seen.start, counts or [])
     pieces = work.proved(cells, budget if counts is None else 0)
@@ -206,7 +213,8 @@ def verify_ode(
     if restarts and any(v.answer is not Answer.VERIFIED for v in verdicts):
         open_ones = [a for a, v in zip(asked, verdicts, strict=True) if v.answer is not Answer.VERIFIED]
         more = search(seen.loop, seen.start, seen.disturbance, open_ones, generator=generator, ascents=True)
-        violation = more if more is not None else violation
+        rollouts += more.rollouts
+        violation = more.violation if more.violation is not None else violation
     if violation is not None:
         for i, v in enumerate(verdicts):
             if v.name == violation.requirement and violation.proved:
@@ -216,11 +224,12 @@ def verify_ode(
         seen.loop,
         seen.start,
         seen.disturbance,
-        tuple(formulas),
+        tuple(asked),
         tuple(pieces),
         tuple(verdicts),
         bounded,
         violation,
+        rollouts,
         time.process_time() - began,
         notes,
         propagator.name,
@@ -229,11 +238,15 @@ def verify_ode(
 
 def _named(formulas: Sequence[Formula]) -> list[Formula]:
     """The same with names of their own: the second ``inside`` is ``inside 2``."""
-    seen: dict[str, int] = {}
+    used: set[str] = set()
     found = []
     for formula in formulas:
-        seen[formula.name] = count = seen.get(formula.name, 0) + 1
-        found.append(formula if count == 1 else replace(formula, name=f"{formula.name} {count}"))
+        if not isinstance(formula.name, str) or not 0 < len(formula.name) <= LONGEST_NAME:
+            raise UsageError(f"the name of a requirement has 1 to {LONGEST_NAME} characters, found {formula.name!r}")
+        names = itertools.chain([formula.name], (f"{formula.name} {i}" for i in itertools.count(2)))
+        name = next(name for name in names if name not in used)
+        used.add(name)
+        found.append(replace(formula, name=name))
     return found
 
 
@@ -360,25 +373,27 @@ def _verdicts(asked: Sequence[Asked], pieces: Sequence[Piece]) -> list[Requireme
 
 
 def _refuted(
-    seen: ObservedOde, asked: Sequence[Asked], violation: Violation, propagator: Propagator, seconds: float
-) -> OdeProof:
+    seen: ObservedOde, asked: Sequence[Asked], found: Found, propagator: Propagator, seconds: float
+) -> OdeProof:  # fmt: skip
     """The verdict where a violation was found before anything was bounded."""
+    violation = found.violation
+    assert violation is not None
     verdicts = [
         RequirementVerdict(a.formula.name, Answer.FALSIFIED, -violation.depth, violation.time)
         if a.formula.name == violation.requirement
         else RequirementVerdict(a.formula.name, Answer.UNKNOWN, -math.inf, 0.0)
         for a in asked
     ]
-    formulas = tuple(a.formula for a in asked)
     return OdeProof(
         seen.loop,
         seen.start,
         seen.disturbance,
-        formulas,
+        tuple(asked),
         (),
         tuple(verdicts),
         False,
         violation,
+        found.rollouts,
         seconds,
         (),
         propagator.name,

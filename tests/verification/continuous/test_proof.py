@@ -11,6 +11,9 @@ from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.continuous.observed import observed_ode
 from sagemp_cli.scenes.requirements import Holds, Inside, Outside
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.verification.continuous.attack import PIECES
+from sagemp_cli.verification.continuous.attack import _all_break as breaks
+from sagemp_cli.verification.continuous.attack import _signals as attack_signals
 from sagemp_cli.verification.continuous.judging import Asked, judged
 from sagemp_cli.verification.continuous.proof import verify_ode
 from sagemp_cli.verification.verdict import Answer
@@ -80,6 +83,43 @@ def test_a_violation_between_two_samples_alone_is_not_called_proved():
     assert verdict(inside, observed=observed).answer is Answer.FALSIFIED
     wide = Inside({"angle": (-peak * 1.2, peak * 1.2)})
     assert verdict(wide, observed=observed, substeps=4, order=3).answer is Answer.VERIFIED
+
+
+def test_a_swing_that_only_a_disturbance_in_its_own_rhythm_breaks_is_found():
+    """A turn of the body takes one period: a disturbance that is constant on it swings it to 2, its rhythm to 12."""
+    omega = 2 * math.pi
+    swing = lambda x, u: torch.cat([x[..., 1:], -(omega**2) * x[..., :1] + 0 * u], -1)  # noqa: E731
+    still, push = box([0.0, 0.0], [0.0, 0.0]), box([0.0, -(omega**2)], [0.0, omega**2])
+    observed = seen(swing, lambda x: 0 * x[..., :1], still, push, period=1.0, horizon=3)
+    proof = verdict(Inside({"angle": (-9.0, 9.0)}), observed=observed, substeps=8, order=3)
+    assert proof.answer is Answer.FALSIFIED and proof.violation.proved
+    signal = proof.violation.signal
+    assert bool(push.contains(signal).all()) and len(signal) == 3 * PIECES
+    assert bool((signal[:, 1].unflatten(0, (3, PIECES)).diff(dim=1) != 0).any())  # within a period
+    enough = Inside({"angle": (-13.0, 13.0)})
+    assert verdict(enough, observed=observed, substeps=8, order=3).answer is not Answer.FALSIFIED
+
+
+def test_signals_of_the_search_are_of_w_and_reach_its_corners():
+    loop, w = seen(horizon=3).loop, box([-1.0, 2.0], [1.0, 2.0])
+    signals = attack_signals(w, loop.horizon * PIECES, torch.Generator().manual_seed(0))
+    assert signals.shape[1:] == (3 * PIECES, 2)
+    assert bool(w.contains(signals).all()) and bool((signals[1:, :, 0].abs() == 1).all())
+    switches = (signals[..., 0].diff(dim=1) != 0).sum(1)
+    assert int(switches.max()) == 3 * PIECES - 1 and int(switches[4:8].min()) == 0
+
+
+def test_what_is_no_number_breaks_nothing():
+    """A margin that is not defined on all of an enclosure has no bounds there."""
+    observed = seen()
+    asked = [
+        Asked.of(Holds(lambda x: torch.log(x[..., :1]) - 9).formula(NAMES), observed.loop, START.center),
+        Asked.of(Inside({"angle": (5.0, 6.0)}).formula(NAMES), observed.loop, START.center),
+    ]
+    assert not bool(breaks(asked[0], box([[-1.0, 0.0]], [[1.0, 0.0]])).any())
+    for low, high in ((-math.inf, 1.0), (0.5, math.inf), (-math.inf, -math.inf)):
+        assert not any(bool(breaks(one, box([[low, 0.0]], [[high, 0.0]])).any()) for one in asked)
+    assert all(bool(breaks(one, box([[0.5, 0.0]], [[0.6, 0.0]])).all()) for one in asked)
 
 
 def test_more_cells_are_taken_where_one_does_not_do():
