@@ -59,6 +59,8 @@ def test_a_robot_that_says_all_of_it_is_proved_with_one_argument(sagemp, robots,
     checked = sagemp("check", data["certificate"])
     assert checked.exit_code == 0, checked.output
     assert "requirement inside  at all these times: angle -0.5 to 0.5" in checked.stdout
+    again = sagemp("recheck", data["certificate"], "disc")
+    assert again.exit_code == 2 and "about requirements of an ODE of one's own" in again.stderr
     again = sagemp("prove", f"{robots}:Robot")
     assert again.exit_code == 2 and "--overwrite" in again.stderr
 
