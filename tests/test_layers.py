@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent / "sagemp_cli"
 
 LAYERS = (
-    ("errors",),
+    ("errors", "monitor"),
     ("progress", "workers", "reading"),
     ("plugins",),
     ("config",),

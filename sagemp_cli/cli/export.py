@@ -19,6 +19,29 @@ EXAMPLES = examples(
 )
 
 
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "sagemp export monitor artifacts/unicycle_node/library.h5 --to robot/monitor.npz",
+        "sagemp export monitor certificate.h5",
+    ),
+)
+def monitor(
+    file: Annotated[Path, typer.Argument(help="A certificate or a library.")],
+    to: Annotated[Path, typer.Option("--to", metavar="FILE", help="The NPZ file to write.")] = Path("monitor.npz"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the tubes for the runtime monitor, and beside them the monitor itself: one file that needs only NumPy.
+
+    On the robot [bold]Monitor.load("monitor.npz", reference=2)[/bold] compares each measured state with the tube; see
+    its docstring. Only certified references are written; the tubes are the file's, 'sagemp check' proves them.
+    """
+    from sagemp_cli.stages.export_monitor import export_monitor
+
+    count, module = export_monitor(file, to, overwrite=overwrite)
+    typer.echo(printable(f"{file} -> {to} ({count} certified references), {module}"))
+
+
 @app.command(cls=Command, epilog=EXAMPLES)
 def tracker(
     onnx: Annotated[Path, typer.Option("--onnx", metavar="FILE", help="The ONNX file to write.")],
