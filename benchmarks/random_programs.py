@@ -59,6 +59,9 @@ UNARY = {
     "wrap": lambda x: torch.atan2(torch.sin(3 * x), torch.cos(3 * x)),
     "remainder": lambda x: torch.remainder(x, 1.5),
     "fmod": lambda x: torch.fmod(x, 1.5),
+    "limited": lambda x: torch.where(x > 0.5, 0.5 + 0 * x, x),
+    "root where positive": lambda x: torch.where(x > 0, torch.sqrt(x), -0.1 * x),
+    "inside": lambda x: ((x > -0.3) & (x <= 0.6)).double() * x,
     "shift": lambda x: 0.7 * x - 0.4,
     "up": lambda x: x + 1.3,
 }
@@ -74,9 +77,24 @@ BINARY = {
     "maximum": torch.maximum,
     "minimum": torch.minimum,
     "within": lambda a, b: torch.clamp(a, min=-torch.abs(b), max=torch.abs(b)),
+    "branch": lambda a, b: torch.where(a > 0.2, b, -a),
+    "switch": lambda a, b: torch.where(a >= b, torch.sin(a), 0.3 * b),
+    "larger by hand": lambda a, b: torch.where(a < b, b, a),
     "norm": lambda a, b: torch.sqrt(a * a + b * b),
 }
-CHOOSING = ("angle", "angle away", "angle up", "maximum", "minimum", "within", "divide", "share")
+CHOOSING = (
+    "branch",
+    "switch",
+    "larger by hand",
+    "angle",
+    "angle away",
+    "angle up",
+    "maximum",
+    "minimum",
+    "within",
+    "divide",
+    "share",
+)
 
 
 @dataclass(frozen=True)

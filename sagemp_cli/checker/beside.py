@@ -29,7 +29,8 @@ class Combinations:
     Attributes:
         columns: basic values.
         first: of each nonlinear slot, the first of its own.
-        operands: of each nonlinear slot, its operands, equally long; of two that are compared also their difference.
+        operands: of each nonlinear slot, its operands, equally long; of two that are compared, or that are chosen from,
+            also their difference.
         outputs: of the slots that are outputs.
     """
 
@@ -47,8 +48,8 @@ class Combinations:
                 rows[slot] = self._linear(program, instruction, [rows[r] for r in instruction.reads])
             else:
                 read = repeated([rows[r] for r in instruction.reads])
-                if instruction.kind in ("maximum", "minimum"):
-                    read.append([subtracted(a, b) for a, b in zip(*read, strict=True)])
+                if instruction.kind in ("maximum", "minimum", "where"):
+                    read.append([subtracted(a, b) for a, b in zip(*read[-2:], strict=True)])
                 self.operands[slot] = [_Combination(part) for part in read]
                 self.first[slot] = self.columns
                 rows[slot] = _units(self.columns, program.widths[slot])
@@ -86,7 +87,7 @@ class Beside:
 
     def know(self, slot: int, instruction: Instruction, operands: Sequence[Sequence[Range]]) -> None:
         """The result of a nonlinear slot, from intervals of its operands."""
-        found = values(instruction, operands[:2])
+        found = values(instruction, operands[: len(instruction.reads)])
         first = self._of.first[slot]
         self._ends[first : first + len(found)] = found
 

@@ -186,6 +186,9 @@ class _Writer:
         if kind in PAIRS:
             a, b = (list(o) * (width if len(o) == 1 else 1) for o in operands)
             return [_pair(kind, x, y) for x, y in zip(a, b, strict=True)]
+        if kind == "where":
+            parts = zip(*(list(o) * (width if len(o) == 1 else 1) for o in operands), strict=True)
+            return [f"where({c} > 0, {x}, {y})" for c, x, y in parts]
         if kind == "neg":
             return [f"-{_factor(t)}" for t in operands[0]]
         if kind == "identity":

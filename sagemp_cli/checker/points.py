@@ -46,6 +46,10 @@ def value_of(instruction: Instruction, operands: Sequence[Point]) -> Point:
         width = max(map(len, operands))
         pairs = zip(*(list(o) * (width if len(o) == 1 else 1) for o in operands), strict=True)
         return [_PAIRS[kind](a, b) for a, b in pairs]
+    if kind == "where":
+        width = max(map(len, operands))
+        entries = zip(*(list(o) * (width if len(o) == 1 else 1) for o in operands), strict=True)
+        return [a if c > 0 else b if c <= 0 else a.union(b) for c, a, b in entries]
     if kind == "neg":
         return [-a for a in operands[0]]
     return [f.value(a) for f, a in zip(functions_of(instruction, len(operands[0])), operands[0], strict=True)]

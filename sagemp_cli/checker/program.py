@@ -23,9 +23,10 @@ SCALARS = (
 WITH_NUMBERS: Mapping[str, int] = {"leaky_relu": 1, "elu": 1, "softplus": 2, "pow": 1, "remainder": 1, "fmod": 1}
 """Functions of one value that have constants, and how many."""
 PAIRS = ("add", "sub", "mul", "div", "maximum", "minimum", "atan2")
+TRIPLES = ("where",)
 UNARY = ("pick", "linear", "neg", "clamp", "identity", *SCALARS, *WITH_NUMBERS)
 
-KINDS = (*INPUTS, "constant", "join", *UNARY, *PAIRS)
+KINDS = (*INPUTS, "constant", "join", *UNARY, *PAIRS, *TRIPLES)
 """All kinds of instructions."""
 
 _MOST_INSTRUCTIONS = 10_000
@@ -133,8 +134,8 @@ class Program:
 
     @property
     def variables(self) -> int:
-        """How many variables these add; a direction adds none."""
-        return sum(count for slot in self.relaxed for name, count in slot if name != "direction")
+        """How many variables these add; a direction and a ratio add none."""
+        return sum(count for slot in self.relaxed for name, count in slot if name not in ("direction", "ratio"))
 
     @property
     def controls(self) -> int:
@@ -204,7 +205,7 @@ _ALLOWED: Mapping[str, tuple[Callable[[float], bool], str]] = {
 def _width(instruction: Instruction, read: Sequence[int], sizes: Mapping[str, int]) -> int:
     """Entries of an instruction's result."""
     kind, constants, count = instruction.kind, instruction.constants, len(instruction.constants)
-    wanted = 0 if kind in INPUTS or kind == "constant" else 2 if kind in PAIRS else 1
+    wanted = 0 if kind in INPUTS or kind == "constant" else 2 if kind in PAIRS else 3 if kind in TRIPLES else 1
     if kind not in KINDS:
         raise ValueError("there is no such instruction")
     if kind == "join":
@@ -236,10 +237,10 @@ def _width(instruction: Instruction, read: Sequence[int], sizes: Mapping[str, in
             raise ValueError(f"it picks entries that an operand of {read[0]} does not have")
     elif kind == "join":
         width = sum(read)
-    elif kind in PAIRS:
+    elif kind in PAIRS or kind in TRIPLES:
         width = max(read)
-        if min(read) not in (1, width):
-            raise ValueError(f"its operands have {read[0]} and {read[1]} entries")
+        if not {1, width} >= set(read):
+            raise ValueError(f"its operands have {' and '.join(map(str, read))} entries")
     else:
         width = read[0]
     if kind in _ALLOWED and not _ALLOWED[kind][0](constants[0]):
@@ -264,7 +265,8 @@ def _relaxations(
         return (*divisor, ("product", width)) if all(given) else divisor
     if kind in ("maximum", "minimum"):
         return (("relu" if all(given) else "clamp", width),)
-    return (("atan2", width), ("direction", width)) if kind == "atan2" else ((kind, width),)
+    beside = {"atan2": (("direction", width),), "where": (("ratio", width),)}.get(kind, ())
+    return ((kind, width), *beside)
 
 
 def _few(slots: Sequence[int] | object) -> str:

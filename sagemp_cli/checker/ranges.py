@@ -22,6 +22,8 @@ _ZERO = arb(0)
 def values(instruction: Instruction, operands: Sequence[Sequence[Range]]) -> list[Range]:
     """Of a nonlinear instruction, from those of its operands, which are equally long."""
     kind = instruction.kind
+    if kind == "where":
+        return [_outwards(_chosen(*entry)) for entry in zip(*operands, strict=True)]
     if kind in _PAIRS:
         if kind == "mul" and instruction.reads[0] == instruction.reads[1]:
             return [_outwards(None if a is None else _power(a, 2)) for a in operands[0]]
@@ -42,6 +44,13 @@ def _outwards(a: Range) -> Range:
     if a is None or not (a[0].is_finite() and a[1].is_finite()):
         return None
     return a[0].lower(), a[1].upper()
+
+
+def _chosen(c: Range, a: Range, b: Range) -> Range:
+    """a where c is positive, else b."""
+    if c is not None and (c[0] > 0 or c[1] <= 0):
+        return a if c[0] > 0 else b
+    return None if a is None or b is None else (a[0].min(b[0]), a[1].max(b[1]))
 
 
 def _of_one(instruction: Instruction, i: int, a: Range) -> Range:

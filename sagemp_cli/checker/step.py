@@ -140,6 +140,9 @@ class Step:
             )
         elif kind == "atan2":
             rows = self._angle(*_pair(repeated(operands)), within)
+        elif kind == "where":
+            condition, left, right = repeated(operands)
+            rows = self._choice(condition, left, right, within)
         else:
             functions = functions_of(instruction, len(operands[0]))
             rows = self._relaxed(kind, operands[0], [f.excess for f in functions], within[0])
@@ -249,6 +252,42 @@ class Step:
             out.append(self._put("atan2", times(across[i], slope), found, entry))
         return out
 
+    def _choice(self, condition: Rows, left: Rows, right: Rows, within: Sequence[list[Range]]) -> Rows:
+        """``b`` and, where c is positive, ``d = a - b``; where it is known which, a or b itself.
+
+        Around ``s d``, s the recorded slope, what is left is ``(1 - s) d`` where c is positive and ``-s d`` elsewhere;
+        on either side d is ``r c + rest`` for the recorded ratio r as for any other, c between 0 and its own end.
+        """
+        entries, ratios = self._take(len(left)), [ball(e.slope) for e in self._take(len(left))]
+        rows = [subtracted(a, b) for a, b in zip(left, right, strict=True)]
+        rest = [subtracted(d, times(c, r)) for d, c, r in zip(rows, condition, ratios, strict=True)]
+        c = _within(self.bounds(condition), within[0])
+        within[0][:] = c
+        d, free = _within(self.bounds(rows), within[3]), self.bounds(rest)
+        out = []
+        for i, entry in enumerate(entries):
+            if c[i][0] > 0 or c[i][1] <= 0:
+                out.append(
+                    self._put("where", list(left[i] if c[i][0] > 0 else right[i]), (ZERO, ZERO), entry, offset=False)
+                )
+                continue
+            slope = ball(entry.slope)
+            ends = []
+            for share, end in ((1 - slope, c[i][1].max(ZERO)), (-slope, c[i][0].min(ZERO))):
+                reach = ratios[i] * end
+                low, high = free[i][0] + reach.min(ZERO), free[i][1] + reach.max(ZERO)
+                low, high = low.max(d[i][0]), high.min(d[i][1])
+                if not low > high:  # else nothing is on this side
+                    ends += [share * low, share * high]
+            if not ends:
+                raise Unproved("no value of a condition is left")
+            least, most = ends[0], ends[0]
+            for end in ends[1:]:
+                least, most = least.min(end), most.max(end)
+            row = added(right[i], times(rows[i], slope))
+            out.append(self._put("where", row, (least, most), entry))
+        return out
+
     def _take(self, count: int) -> Sequence[Entry]:
         entries = self._record[self._taken : self._taken + count]
         self._taken += count
@@ -256,16 +295,16 @@ class Step:
             raise Unproved("the step takes more relaxations than are recorded")
         return entries
 
-    def _put(self, name: str, row: Row, bounds: tuple[arb, arb], entry: Entry) -> Row:
-        """Add what lies within bounds to a row: the recorded offset and a new variable around it."""
+    def _put(self, name: str, row: Row, bounds: tuple[arb, arb], entry: Entry, *, offset: bool = True) -> Row:
+        """Add what lies within bounds to a row: the recorded offset, if it has one, and a new variable around it."""
         least, most = bounds
-        offset = ball(entry.offset)
-        radius = (most - offset).max(offset - least).upper()
+        middle = ball(entry.offset) if offset else ZERO
+        radius = (most - middle).max(middle - least).upper()
         if not (radius <= ball(entry.radius) or radius <= ball(_UNDERFLOW)):
             raise Unproved(
                 f"a recorded relaxation of '{name}' is wrong: its radius is {float(radius):.9g}, not {entry.radius:.9g}"
             )
-        row[0] = row[0] + offset
+        row[0] = row[0] + middle
         row += repeat(ZERO, self._next - len(row))
         row.append(radius)
         self._next += 1

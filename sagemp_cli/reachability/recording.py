@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,8 +19,12 @@ from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 
 
-def recorded_bands(name: str, band: Band, turn: Turn | None) -> list[tuple[str, Band]]:
-    """What is kept of an operation: its band, and of an angle the direction that its line is across, written as one."""
+def recorded_bands(name: str, band: Band, turn: Turn | None, ratio: Any = None) -> list[tuple[str, Band]]:
+    """What is kept of an operation: its band, and of an angle the direction that its line is across, of a choice the
+    ratio that its bounds rest on, written as one.
+    """
+    if ratio is not None:
+        return [(name, band), ("ratio", Band(ratio, 0.0 * ratio, 0.0 * ratio))]
     if turn is None:
         return [(name, band)]
     return [(name, band), ("direction", Band(turn.cosine, turn.sine, 0.0 * turn.cosine))]

@@ -62,6 +62,8 @@ def run(made: Program, x: np.ndarray, w: np.ndarray, numbers: np.ndarray | None 
             value = OF_TWO[kind](*read)
         elif kind in OF_ONE:
             value = OF_ONE[kind](read[0])
+        elif kind == "where":
+            value = torch.where(read[0] > 0, read[1], read[2])
         elif kind == "clamp":
             value = torch.minimum(
                 torch.maximum(read[0], constants[: len(constants) // 2]), constants[len(constants) // 2 :]

@@ -42,6 +42,8 @@ from .by_hand import line, program
         ([line("leaky_relu", 0, constants=[1.5])], "it needs a slope of at most 1, found 1.5"),
         ([line("softplus", 0, constants=[0.0, 20.0])], "it needs a positive beta, found 0.0"),
         ([line("elu", 0, constants=[-2.0])], "it needs a positive alpha, found -2.0"),
+        ([line("where", 0, 1)], "it reads 2 slots, 3 are needed"),
+        ([line("join", 0, 1), line("where", 0, 2, 1)], "its operands have 2 and 3 and 1 entries"),
         ([line("fmod", 0, constants=[0.0])], "it needs a positive period, found 0.0"),
         ([line("state")], "the inputs come first: state, disturbance, numbers"),
         ([line("neg", 0), line("numbers")], "the inputs come first: state, disturbance, numbers"),

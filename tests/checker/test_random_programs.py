@@ -78,6 +78,10 @@ SQUASHED = {
     "a saturated control that turns": lambda x, w: 0.5 * x + torch.clamp(9.0 * x, -1.0, 1.0) * torch.cos(x) + w,
     "root of what is not negative": lambda x, w: torch.sqrt(torch.relu(x)) + w,
     "larger and smaller of two": lambda x, w: torch.minimum(torch.maximum(x, torch.flip(x, [-1])), 0.3 * x + 0.5) + w,
+    "a limit by hand": lambda x, w: torch.where(x > 0.4, 0.4 + 0.0 * x, 0.9 * x) + w,
+    "a switch": lambda x, w: 0.5 * x - 0.2 * torch.where(x + 0.5 * x.flip(-1) > 0, 1.0 + 0.1 * x, -0.5 * x) + w,
+    "gelu and what is rounded": lambda x, w: 0.5 * torch.nn.functional.gelu(3 * x) - 0.1 * torch.round(8 * x) + w,
+    "an angle that is wrapped": lambda x, w: 0.3 * torch.atan2(torch.sin(4 * x), torch.cos(4 * x)) + w,
     "a share": lambda x, w: 0.25 * torch.exp(x) / torch.exp(x).sum(-1, keepdim=True) + w,
 }
 

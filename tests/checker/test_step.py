@@ -113,6 +113,15 @@ NONLINEAR = {
     "atan2": [*PAIRS, line("atan2", 3, 2), line("join", 4, 4)],
     "atan2 of w": [line("add", X, W), line("atan2", X, 2), line("pick", 3, entries=[0, 0])],
     "atan2 behind": [*PAIRS, line("neg", 2), line("atan2", 2, 4), line("join", 5, W)],
+    "where": [*PAIRS, line("where", 3, 2, 3), line("join", 4, W)],
+    "where of branches that meet": [
+        *PAIRS, line("constant", constants=[0.0]), line("where", 3, 3, 4), line("join", 5, W),
+    ],
+    "where of a number for all": [line("pick", X, entries=[1]), line("neg", X), line("where", 2, X, 3)],
+    "where undecided of numbers": [
+        line("constant", constants=[1.0, 2.0]), line("constant", constants=[-1.0]), line("add", X, W),
+        line("pick", 4, entries=[1]), line("where", 5, 2, 3),
+    ],
     "atan2 beside a number": [*PAIRS, line("constant", constants=[2.0]), line("atan2", 3, 4), line("join", 5, 5)],
 }  # fmt: skip
 

@@ -131,7 +131,17 @@ def _linear(x: IntervalForm, weight: Tensor, bias: Tensor) -> IntervalForm:
     return _signed(low - margin, high + margin, (below == 0) & (bias >= 0), (above == 0) & (bias <= 0))
 
 
+def _chosen(c: IntervalForm, a: IntervalForm, b: IntervalForm) -> IntervalForm:
+    """One of two where it is known which, else both."""
+    m, yes, no = functions_of(a.lower), c.lower > 0, c.upper <= 0
+    return IntervalForm(
+        m.where(yes, a.lower, m.where(no, b.lower, m.minimum(a.lower, b.lower))),
+        m.where(yes, a.upper, m.where(no, b.upper, m.maximum(a.upper, b.upper))),
+    )
+
+
 _RULES = {
+    "where": _chosen,
     "neg": _negative,
     "add": _sum,
     "sub": lambda a, b: _sum(a, _negative(b)),

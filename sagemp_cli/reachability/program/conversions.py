@@ -47,9 +47,8 @@ _TYPES = {
     "long": torch.int64,
 }
 _CHOICES = """
-    all allclose any bucketize count_nonzero eq equal ge greater greater_equal gt heaviside isclose isfinite isinf isnan
-    le less less_equal logical_and logical_not logical_or logical_xor lt masked_select ne nonzero not_equal searchsorted
-    signbit unique where
+    all allclose any bucketize count_nonzero equal isclose isfinite isinf isnan masked_select nonzero searchsorted
+    signbit unique
 """
 _PLACES = "argmax argmin argsort argwhere cummax cummin kthvalue median mode msort nanmedian quantile sort topk"
 _NUMBERS = "__bool__ __float__ __index__ __int__ item numpy tolist"
@@ -67,7 +66,7 @@ for _word in _NUMBERS.split():
 def _refuse_choice(name: str) -> None:
     raise UnsupportedOperationError(
         f"torch operation '{name}' chooses by a value, which on a set is neither True nor False; "
-        f"use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+        f"use torch.where, torch.clamp, torch.minimum, torch.maximum or torch.relu"
     )
 
 

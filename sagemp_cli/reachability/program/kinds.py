@@ -66,6 +66,9 @@ OF_TWO: Mapping[str, Function] = {
 }
 """Functions of two vectors, entry by entry; a vector of one entry goes with every entry of the other."""
 
+OF_THREE: Mapping[str, Function] = {"where": lambda c, a, b: torch.where(c > 0, a, b)}
+"""Functions of three vectors, entry by entry; the same of vectors of one entry."""
+
 CONSTANTS: Mapping[str, tuple[str, ...]] = {
     "constant": ("the vector",),
     "linear": ("matrix", "bias"),
@@ -79,7 +82,7 @@ CONSTANTS: Mapping[str, tuple[str, ...]] = {
 }
 """The constants of the kinds that have any: vectors as long as the result, the matrix ``(r, c)``, else one number."""
 
-KINDS = (*INPUTS, "constant", "pick", "join", "linear", *OF_TWO, *OF_ONE)
+KINDS = (*INPUTS, "constant", "pick", "join", "linear", *OF_THREE, *OF_TWO, *OF_ONE)
 """All of them."""
 
 

@@ -59,6 +59,7 @@ class Example:
         self._constants: dict[int, Tensor] = {}
         self._largest: float | None = None  # number among the operands
         self._recorder: Any = None
+        self._of_truth = False  # whether a truth value is among the operands
         self.result: Any = None
 
     def run(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Example:
@@ -84,11 +85,14 @@ class Example:
 
     def _tensor(self, value: Any) -> Tensor:
         ids, self._recorder = value.ids, value.recorder
+        self._of_truth |= value.truth
         storage = ids.untyped_storage()
         block = self._blocks.get(storage._cdata)
         if block is None:
             flat = ids.as_strided((storage.nbytes() // ids.element_size(),), (1,), 0)
             numbers = self._recorder.example(flat)
+            if value.truth:
+                numbers = numbers.bool()
             self._blocks[storage._cdata] = block = _Block(flat, numbers)
         return block.numbers.as_strided(ids.size(), ids.stride(), ids.storage_offset())
 
@@ -116,12 +120,13 @@ class Example:
             raise _other(name, f"gives shape {found}, recorded was {tuple(answer.shape)}")
         if self._is_constant(result):
             return result  # a view of a constant is that constant, and what is written into it is
-        if result.dtype is not torch.float64:
+        truth = result.dtype is torch.bool
+        if result.dtype is not torch.float64 and not truth and not (name == "float" and self._of_truth):
             raise _other(name, f"gives {result.dtype}")
         ids = self._in_memory(answer.ids, result, name)
         if not self._same(ids, result):
             raise _other(name, "gives another number")
-        return answer._like(ids)
+        return type(answer)(answer.recorder, ids, truth=truth)
 
     def _in_memory(self, ids: Tensor, result: Tensor, name: str) -> Tensor:
         where = result.untyped_storage()._cdata
@@ -156,6 +161,7 @@ class Example:
 
     def _same(self, ids: Tensor, numbers: Tensor) -> bool:
         recorded = self._recorder.example(ids)
+        numbers = numbers.to(recorded.dtype)
         if torch.equal(recorded, numbers):  # the most frequent case by far, and quickly told
             return True
         off = (recorded - numbers).abs() > _CLOSE * (self._find_largest() + numbers.abs())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -57,5 +59,4 @@ def _through(i: Instruction, operands: Sequence[Tensor]) -> Tensor:
         return torch.cat(list(operands))
     if i.kind == "linear":
         return ((i.constants[0] != 0) & operands[0]).any(-1)
-    found = operands[0] if len(operands) == 1 else operands[0] | operands[1]
-    return found.expand(i.size)
+    return functools.reduce(operator.or_, operands).expand(i.size)

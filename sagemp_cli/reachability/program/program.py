@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.reachability.program.kinds import CONSTANTS, INPUTS, KINDS, OF_ONE, OF_TWO, join, pick
+from sagemp_cli.reachability.program.kinds import CONSTANTS, INPUTS, KINDS, OF_ONE, OF_THREE, OF_TWO, join, pick
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Instruction:
             return join(operands)
         if self.kind == "linear":
             return torch.nn.functional.linear(operands[0], *self.constants)
-        return (OF_ONE.get(self.kind) or OF_TWO[self.kind])(*operands, *self.constants)
+        return (OF_ONE.get(self.kind) or OF_TWO.get(self.kind) or OF_THREE[self.kind])(*operands, *self.constants)
 
 
 Evaluate = Callable[[Instruction, Sequence[Any]], Any]
@@ -205,7 +205,7 @@ def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str 
         return "reads constants only, which are one constant"
     sizes = [before[o].size for o in i.operands]
     count = {"pick": 1, "linear": 1, "join": max(len(sizes), 1)}.get(
-        i.kind, (i.kind in OF_ONE) + 2 * (i.kind in OF_TWO)
+        i.kind, (i.kind in OF_ONE) + 2 * (i.kind in OF_TWO) + 3 * (i.kind in OF_THREE)
     )
     if len(sizes) != count:
         return f"reads {len(sizes)} slots, expected {count}"
@@ -216,7 +216,7 @@ def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str 
         "join": sum(sizes),
         "linear": i.size,
     }.get(i.kind, max(sizes, default=i.size))
-    if i.size != made or (i.kind in OF_TWO and not set(sizes) <= {1, made}):
+    if i.size != made or (len(sizes) > 1 and i.kind != "join" and not set(sizes) <= {1, made}):
         return f"makes {i.size} entries of {sizes}"
     if any(not 0 <= e < sizes[0] for e in i.entries) or (i.entries and i.kind != "pick"):
         return "picks entries that are not there"

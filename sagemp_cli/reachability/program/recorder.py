@@ -6,7 +6,7 @@ from, so that whatever only moves entries is done by torch itself, on ids.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,6 +124,84 @@ class Recorder:
             found.append(of[0])
         return torch.tensor(found, dtype=torch.int64).reshape(sines.shape) if found else None
 
+    def condition_of(self, truth: Tensor) -> tuple[Tensor, bool] | None:
+        """Ids of what is positive where truth values with these ids are 1, or (True) where they are 0; None if they are
+        no comparisons, or of both kinds.
+        """
+        found: list[int] = []
+        kinds: set[bool] = set()
+        for id_ in truth.reshape(-1).tolist():
+            owner = self._instructions[int(self._owner[id_])]
+            place = id_ - self._starts[int(self._owner[id_])]
+            negated = owner.kind == "sub"
+            if negated:  # 1 less a truth value
+                one, inner = (self._instructions[o] for o in owner.operands)
+                if one.kind != "constant" or not bool((one.constants[0] == 1).all()) or inner.kind != "positive":
+                    return None
+                owner = inner
+            if owner.kind != "positive":
+                return None
+            kinds.add(negated)
+            found.append(self._starts[owner.operands[0]] + min(place, owner.size - 1))
+        if len(kinds) != 1:
+            return None
+        return torch.tensor(found, dtype=torch.int64).reshape(truth.shape), kinds.pop()
+
+    def instruction_of(self, id_: int) -> tuple[Instruction, int]:
+        """What made a value, and which entry of the result it is."""
+        owner = int(self._owner[id_])
+        return self._instructions[owner], id_ - self._starts[owner]
+
+    def ids_of_slot(self, slot: int) -> Tensor:
+        """Of all entries of an instruction's result."""
+        return torch.arange(self._starts[slot], self._starts[slot] + self._instructions[slot].size)
+
+    def replaced(self, ids: Tensor, old: Tensor, new: Tensor) -> tuple[Tensor, tuple[str, ...]]:
+        """Values with these ids, computed again with other values in the places of some; and the kinds of instructions
+        that this takes, none if they do not depend on them.
+
+        Args:
+            ids: of what is computed again.
+            old, new: ids, one for one; what is the same instruction on the same values is replaced too.
+        """
+        numbers: dict[Any, int] = {}
+        number = [numbers.setdefault(key, len(numbers)) for key in self._keys(numbers)]
+        known = dict(zip(old.reshape(-1).tolist(), new.reshape(-1).tolist(), strict=True))
+        alike = {(number[int(self._owner[o])], o - self._starts[int(self._owner[o])]): n for o, n in known.items()}
+        made: dict[int, Tensor] = {}
+        kinds: list[str] = []
+
+        def translated(of: Tensor) -> Tensor:
+            """After all that they depend on."""
+            out = []
+            for id_ in of.reshape(-1).tolist():
+                owner = int(self._owner[id_])
+                again, place = made.get(owner), id_ - self._starts[owner]
+                out.append(alike.get((number[owner], place), id_ if again is None else int(again[place])))
+            return torch.tensor(out, dtype=torch.int64).reshape(of.shape)
+
+        order, pending = set(), set(self._owner[ids.reshape(-1)].tolist())
+        while pending:
+            slot = pending.pop()
+            if slot not in order:
+                order.add(slot)
+                pending.update(self._instructions[slot].operands)
+        for slot in sorted(order):
+            i = self._instructions[slot]
+            before = [self.ids_of_slot(o) for o in i.operands]
+            after = [translated(b) for b in before]
+            if all(torch.equal(a, b) for a, b in zip(after, before, strict=True)):
+                continue
+            if i.kind == "pick":
+                made[slot] = after[0][list(i.entries)]
+            elif i.kind == "join":
+                made[slot] = torch.cat(after)
+            else:
+                kinds.append(i.kind)
+                read = [self.operand(a, full=len(a) > 1) for a in after]
+                made[slot] = self.write(i.kind, read, i.constants)
+        return translated(ids), tuple(kinds)
+
     def size_of(self, slot: Slot) -> int:
         """Entries of an instruction's result."""
         return self._instructions[slot.index].size
@@ -136,6 +214,16 @@ class Recorder:
             slots[name] = self._constant_slot(operand) if isinstance(operand, Tensor) else operand and operand.index
         inputs = {int(self._owner[ids[0]]) for ids in (self.state, self.disturbance, self.numbers) if len(ids)}
         return program_of(self._instructions, inputs, slots)
+
+    def _keys(self, numbers: dict[Any, int]) -> Iterator[Any]:
+        """Of every instruction what is equal for the same on the same values, as these are numbered so far."""
+        of: list[int] = []
+        for i in self._instructions:
+            own = tuple(c.detach().numpy().tobytes() for c in i.constants)
+            first = len(of) if i.kind in INPUTS else None
+            key = (i.kind, tuple(of[o] for o in i.operands), own, i.entries, i.size, first)
+            of.append(numbers.get(key, len(numbers)))
+            yield key
 
     # -- bookkeeping ---------------------------------------------------------------------------------------------------
 

@@ -87,14 +87,16 @@ class Traced(Tensor):
 
     ids: Tensor
     recorder: Recorder
+    truth: bool
 
     @staticmethod
-    def __new__(cls, recorder: Recorder, ids: Tensor) -> Traced:
-        """A value whose entries have these ids."""
+    def __new__(cls, recorder: Recorder, ids: Tensor, *, truth: bool = False) -> Traced:
+        """A value whose entries have these ids; of truth values, which are 1 and 0 in the program."""
         memory = torch.full((ids.untyped_storage().nbytes() // ids.element_size(),), torch.nan, dtype=torch.float64)
         value = Tensor._make_subclass(cls, memory.as_strided(ids.size(), ids.stride(), ids.storage_offset()))
         value.ids = ids
         value.recorder = recorder
+        value.truth = truth
         return value
 
     __hash__ = object.__hash__
@@ -104,7 +106,7 @@ class Traced(Tensor):
     if not TYPE_CHECKING:  # torch declares attributes, which it takes no property for
         shape = property(lambda self: self.ids.shape)
         ndim = property(lambda self: self.ids.dim())
-        dtype = property(lambda self: torch.float64)
+        dtype = property(lambda self: torch.bool if self.truth else torch.float64)
         device = property(lambda self: self.ids.device)
         layout = property(lambda self: torch.strided)
         requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
@@ -137,8 +139,8 @@ class Traced(Tensor):
     nelement = numel
 
     def is_floating_point(self) -> bool:
-        """True."""
-        return True
+        """Whether it is no truth value."""
+        return not self.truth
 
     is_contiguous = lambda self, *args, **kwargs: cast(Traced, self).ids.is_contiguous(*args, **kwargs)  # noqa: E731
     is_complex = lambda self: False  # noqa: E731
@@ -159,7 +161,7 @@ class Traced(Tensor):
         return f"Traced(shape={tuple(self.shape)})"
 
     def _like(self, ids: Tensor) -> Traced:
-        return Traced(self.recorder, ids)
+        return cast(Any, Traced)(self.recorder, ids, truth=self.truth)
 
     def _moved(self, name: str, ids: Callable[[Tensor], Tensor]) -> Traced:
         return asked(name, (self,), {}, lambda value: value._like(ids(value.ids)))
@@ -176,7 +178,8 @@ class Traced(Tensor):
         return asked("entries", (self, index), {}, lambda value, index: value._like(value.ids[index]))
 
     def __setitem__(self, index: Any, value: Any) -> None:
-        refuse_traced_index(index)
+        if not (isinstance(index, Traced) and index.truth):  # assignment by a mask is a choice
+            refuse_traced_index(index)
         asked("assignment", (self, index, value), {}, _assign)
 
     # -- what a set does not have -------------------------------------------------------------------------------------
@@ -184,11 +187,11 @@ class Traced(Tensor):
     def _compared(self, *_: Any) -> Any:
         return self._refuse(
             "comparison: a step may not branch on a value, the truth of a set is not one of True and False; "
-            "use torch.clamp, torch.minimum, torch.maximum or torch.relu"
+            "use torch.where, torch.clamp, torch.minimum, torch.maximum or torch.relu"
         )
 
     if not TYPE_CHECKING:  # torch declares what each of them gives
-        __bool__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __contains__ = _compared
+        __bool__ = __contains__ = _compared
 
     def _number(self, *_: Any, **__: Any) -> Any:
         return self._refuse(
@@ -255,6 +258,12 @@ for _name, _function in {
     "matmul": torch.matmul,
     "floordiv": torch.floor_divide,
     "mod": torch.remainder,
+    "lt": torch.lt,
+    "le": torch.le,
+    "gt": torch.gt,
+    "ge": torch.ge,
+    "eq": torch.eq,
+    "ne": torch.ne,
     "and": torch.bitwise_and,
     "or": torch.bitwise_or,
     "xor": torch.bitwise_xor,
@@ -298,6 +307,9 @@ def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 
 def _assign(value: Traced, index: Any, part: Any) -> None:
+    if isinstance(index, Traced) and index.truth:
+        part = _answered(torch.where, (index, part, value), {})
+        index = ...
     value.ids[index] = ids_of(value.recorder, part, "assignment")
 
 
@@ -341,12 +353,25 @@ def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
     # Torch goes first: what it refuses it must refuse before anything is written.
     example = Example(Traced).run(function, args, kwargs)
     kwargs.pop("inplace", None)  # torch's functions hand it over by name
+    if name == "float" and args[0].truth:  # 1 and 0 in any type
+        answer = ANSWERS["double"]
+    if name != "where":
+        args, kwargs = _as_numbers(args), _as_numbers(kwargs)
     try:
         return example.settle(answer(*args, **kwargs), name)
     except TypeError as error:
         raise UnsupportedOperationError(
             f"torch operation '{name}' is not supported with these arguments: {error}"
         ) from error
+
+
+def _as_numbers(value: Any) -> Any:
+    """Arguments with truth values as the numbers 1 and 0."""
+    if isinstance(value, Traced):
+        return Traced(value.recorder, value.ids) if value.truth else value
+    if type(value) in (list, tuple):
+        return type(value)(map(_as_numbers, value))
+    return {key: _as_numbers(one) for key, one in value.items()} if type(value) is dict else value
 
 
 def _answer_of(function: Any, name: str) -> Callable[..., Any]:

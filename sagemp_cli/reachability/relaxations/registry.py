@@ -12,6 +12,7 @@ from torch import Tensor
 from sagemp_cli.reachability.relaxations import absolute as _absolute
 from sagemp_cli.reachability.relaxations import arctangent as _arctangent
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
+from sagemp_cli.reachability.relaxations import choice as _choice
 from sagemp_cli.reachability.relaxations import clamp as _clamp
 from sagemp_cli.reachability.relaxations import elu as _elu
 from sagemp_cli.reachability.relaxations import error_function as _error_function
@@ -115,6 +116,7 @@ OPERATIONS: dict[str, Operation] = {
     "wrap": Operation(_sawtooth.wrap_band, _sawtooth.wrap_lines, _sawtooth.wrap_range),
     "identity": _of(_identity, arrays=True, ranges=True),
     "atan2": _of(_arctangent2),
+    "where": _of(_choice),
 }
 """Of every kind that is not linear, but products and quotients."""
 

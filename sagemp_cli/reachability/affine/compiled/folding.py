@@ -25,7 +25,7 @@ from sagemp_cli.reachability.program.program import Instruction, Outputs, Progra
 from sagemp_cli.reachability.relaxations.registry import Relaxation, relaxation
 from sagemp_cli.sets.rounding import TINY, dot, gamma
 
-Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum"]
+Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum", "choice"]
 
 
 class Combination(NamedTuple):
@@ -67,10 +67,11 @@ class Node(NamedTuple):
 
     Attributes:
         rule: "function", of one variable; "product"; "quotient", whose third operand is the reciprocal of the second;
-            "angle", whose operands are y and x; "maximum" or "minimum" of a and b, whose operands are a - b, a and b.
+            "angle", whose operands are y and x; "maximum" or "minimum" of a and b, whose operands are a - b, a and b;
+            "choice" of a where c is positive, else b, whose operands are a - b, c, a and b.
         operands: its operands, one after the other.
         size: entries of its result.
-        relaxation: of a function or an angle; of a maximum or minimum that of ``relu(a - b)``.
+        relaxation: of a function, an angle or a choice; of a maximum or minimum that of ``relu(a - b)``.
         square: whether a product is of one value with itself.
     """
 
@@ -154,7 +155,9 @@ class _Folding:
             return operands[0]._replace(matrix=-operands[0].matrix)
         if len(operands) == 1:
             return self._node("function", i.size, operands[0], relaxation(i.kind, i.constants))
-        a, b = (o if len(o.matrix) == i.size else o.moved(lambda t: t.expand(i.size, -1)) for o in operands)
+        *condition, a, b = (o if len(o.matrix) == i.size else o.moved(lambda t: t.expand(i.size, -1)) for o in operands)
+        if i.kind == "where":
+            return self._node("choice", i.size, _joined([_sum(a, b, -1.0), *condition, a, b]), relaxation(i.kind))
         constant = [_is_constant(o) for o in (a, b)]
         if i.kind in ("add", "sub"):
             return _sum(a, b, 1.0 if i.kind == "add" else -1.0)

@@ -32,7 +32,10 @@ Array = np.ndarray
 Sides = tuple[Array, Array]
 """Lower and upper bounds ``(B, entries)``; infinite where nothing is known."""
 
-_KINDS = {"product": "mul", "quotient": "div", "angle": "atan2", "maximum": "maximum", "minimum": "minimum"}
+_KINDS = {
+    "product": "mul", "quotient": "div", "angle": "atan2", "maximum": "maximum", "minimum": "minimum",
+    "choice": "where",
+}  # fmt: skip
 
 
 class Intervals:
@@ -183,12 +186,13 @@ def _both(a: Sides, b: Sides) -> Sides:
 
 
 def _result(node: Node, operands: Sides, squares: Array | None) -> Any:
-    """What an operation of two vectors makes of intervals."""
+    """What an operation of two vectors makes of intervals, or a choice between them."""
     n = node.size
-    first = 1 if node.rule in ("maximum", "minimum") else 0  # the difference comes first
-    a, b = (IntervalForm(*(side[:, i * n : (i + 1) * n] for side in operands)) for i in (first, first + 1))
-    instruction = Instruction(_KINDS[node.rule], n)
-    low, high = evaluate(instruction, [a, b]).bounds
+    first = 1 if node.rule in ("maximum", "minimum", "choice") else 0  # the difference comes first
+    count = 3 if node.rule == "choice" else 2
+    parts = [IntervalForm(*(side[:, i * n : (i + 1) * n] for side in operands)) for i in range(first, first + count)]
+    instruction, a = Instruction(_KINDS[node.rule], n), parts[0]
+    low, high = evaluate(instruction, parts).bounds
     if squares is None:
         return low, high
     square = evaluate(instruction, [a, a]).bounds

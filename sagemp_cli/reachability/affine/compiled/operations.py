@@ -25,6 +25,7 @@ from sagemp_cli.reachability.affine.compiled.arrays import added, like, widened,
 from sagemp_cli.reachability.affine.compiled.folding import Node
 from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints, hint_of
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
+from sagemp_cli.reachability.relaxations import choice as _choices
 from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.functions import constant, contiguous, functions_of, on_tensors
@@ -116,6 +117,7 @@ class Relaxed(NamedTuple):
         factors: of a product.
         given: what else the lines depend on, after the bounds, in the input's shape.
         turn: of an angle, the direction across which its input is (:mod:`.relaxations.arctangent2`).
+        ratio: of a choice, what of the difference of both goes with the condition, ``(B, e)``.
     """
 
     name: str
@@ -129,6 +131,7 @@ class Relaxed(NamedTuple):
     factors: Factors | None = None
     given: tuple[Array, ...] = ()
     turn: Turn | None = None
+    ratio: Array | None = None
 
 
 class Frame:
@@ -198,6 +201,19 @@ class Frame:
             radius = radius + np.abs(part, out=part) @ _ONES[: part.shape[-1]]
         return radius
 
+    def ratio(self, x: Value, y: Value) -> Array:
+        """What of x goes with y, near the least squares of ``x - ratio y`` over all symbols; 0 if nothing does."""
+        n, generators = self.both.shape[-1], self.states.generators
+        gram = generators @ generators.swapaxes(-1, -2)
+        sizes = self.own_radius[..., : max(x.coefficients.shape[-1], y.coefficients.shape[-1]) - n]
+        weighted = [(v.coefficients[..., :n], v.coefficients[..., n:]) for v in (x, y)]
+
+        def product(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
+            return ((a[0] @ gram) * b[0]).sum(-1) + (a[1] * b[1] * (sizes * sizes)).sum(-1)
+
+        found = product(*weighted) / product(weighted[1], weighted[1])
+        return self._m.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0)
+
     def slack(self, x: Value) -> Array:
         """What of a radius and a centre is rounding."""
         return x.both[1] * ((x.error + self.sum_error) * SAFETY)
@@ -253,6 +269,7 @@ class Bounded(NamedTuple):
     band: Band
     given: tuple[Array, ...] = ()
     turn: Turn | None = None
+    ratio: Array | None = None
 
 
 def _narrowed(lower: Array, upper: Array, hint: Hint | None) -> tuple[Array, Array]:
@@ -292,11 +309,13 @@ def sine_and_cosine_operands(node: Node, after: Node, frame: Frame, x: Value) ->
 def enclosed(node: Node, frame: Frame, operand: Bounded) -> Value:
     """A function's result, within its band."""
     assert node.relaxation is not None
-    x, lower, upper, band, given, turn = operand
+    x, lower, upper, band, given, turn, ratio = operand
     slope, offset, radius = band
     magnitude = abs(slope) * x.both[1] + abs(offset) + (radius + TINY)
     radius = radius * SAFETY + magnitude * ((x.error + BAND) * SAFETY)
-    relaxed = Relaxed(node.relaxation.name, band, radius, frame.size, x, lower, upper, node, given=given, turn=turn)
+    relaxed = Relaxed(
+        node.relaxation.name, band, radius, frame.size, x, lower, upper, node, given=given, turn=turn, ratio=ratio
+    )
     return frame.result(relaxed, x.both[0] * slope + offset, magnitude, x.coefficients, slope[..., None])
 
 
@@ -391,6 +410,39 @@ def _extreme(node: Node, frame: Frame, operands: Value) -> Value:
     return Value(both, coefficients, max(operands.error, above.error) + SUM)
 
 
+def _choice(node: Node, frame: Frame, operands: Value) -> Value:
+    """``b`` and, where c is positive, ``a - b``; where it is known which, that one itself."""
+    assert node.relaxation is not None
+    m, n = functions_of(operands.both), node.size
+    difference, condition, a, b = (
+        Value(operands.both[..., part], operands.coefficients[:, part], operands.error)
+        for part in (slice(i * n, (i + 1) * n) for i in range(4))
+    )
+    first = Value(operands.both[..., : 2 * n], operands.coefficients[:, : 2 * n], operands.error)
+    lower, upper = frame.operand_bounds(first)
+    with constant(lower):
+        ratio = frame.ratio(difference, condition)
+    (d, size_d), (c, size_c) = difference.both, condition.both
+    rest = Value(
+        m.stack([d - ratio * c, size_d + abs(ratio) * size_c + TINY]),
+        difference.coefficients - ratio[..., None] * condition.coefficients,
+        operands.error + SHIFT,
+    )
+    ends = (lower[:, :n], upper[:, :n], lower[:, n:], upper[:, n:], ratio, *frame.bounds(rest))
+    chosen, *_ = given = on_tensors(_choices.sides, *map(contiguous, ends))
+    lower, upper = _narrowed(lower[:, :n], upper[:, :n], frame.hint("where", n))
+    band = node.relaxation.operation.band_of(lower, upper, *given)
+    open_ = chosen == 0
+    moving = Value(
+        m.where(open_, difference.both, 0.0), m.where(open_[..., None], difference.coefficients, 0.0), operands.error
+    )
+    moved = enclosed(node, frame, Bounded(moving, lower, upper, band, given, ratio=ratio))
+    start = m.where(open_[..., None], b.coefficients, m.where(chosen[..., None] > 0, a.coefficients, b.coefficients))
+    both = m.where(chosen > 0, a.both, b.both)
+    own = m.where(open_[..., None], moved.coefficients, 0.0)
+    return Value(both + m.where(open_, moved.both, 0.0), added(own, start), max(operands.error, moved.error) + SUM)
+
+
 def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     """The angle of a point, of its distance across a direction in the middle of its angles."""
     assert node.relaxation is not None
@@ -438,4 +490,5 @@ EVALUATE: dict[str, Callable[[Node, Frame, Value], Value]] = {
     "angle": _angle,
     "maximum": _extreme,
     "minimum": _extreme,
+    "choice": _choice,
 }
