@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -39,12 +39,12 @@ class Bounds:
 
     Attributes:
         state: ``(lower, upper)`` of the deviations of the states from their centres per target step,
-            ``(*batch, targets, n)``.
-        inputs: the same of each operation's input, per target step and operation, ``(*batch, E)``; infinite
+            ``(B, targets, n)``; None if they were not asked for.
+        inputs: the same of each operation's input, per target step and operation, ``(B, E)``; infinite
             for entries, and None for operations, that were not asked for.
     """
 
-    state: tuple[Tensor, Tensor]
+    state: tuple[Tensor, Tensor] | None
     inputs: list[list[tuple[Tensor, Tensor] | None]]
 
     def intersected(self, other: Bounds) -> Bounds:
@@ -60,44 +60,58 @@ class Bounds:
 
 
 @np.errstate(all="ignore")  # what overflows is unbounded
-def backward(steps: Steps, radius: Tensor, *, targets: range, inputs: bool = False) -> Bounds:
-    """Bounds of the states after the target steps (and of all operations' inputs in these steps) over the start box.
+def backward(
+    steps: Steps, within: Array, *, targets: range, begin: int = 0, states: bool = True, inputs: bool = False
+) -> Bounds:
+    """Bounds of the states after the target steps, and of all operations' inputs in these steps.
 
     Two sweeps, one with tilted and one with level planes over products; neither is always the better one.
 
     Args:
         steps: all of them.
-        radius: of the start box, ``(*batch, n)``.
+        within: generators of a set that holds the state's deviations before step ``begin``, ``(B, n, m)``.
         targets: the steps whose results are bounded.
-        inputs: whether the operations' inputs are bounded too.
+        begin: how far rows go back.
+        states: whether the states are bounded.
+        inputs: whether the operations' inputs are.
     """
-    level = _swept(steps, radius, targets, inputs, False)
-    if not any(extent.products for extent in steps.extents):
+    asked = _Asked(within, targets, begin, states, inputs)
+    level = _swept(steps, asked, False)
+    if not any(steps.extents[k].products for k in range(begin, targets.stop)):
         return level
-    return level.intersected(_swept(steps, radius, targets, inputs, True))
+    return level.intersected(_swept(steps, asked, True))
 
 
-def _swept(steps: Steps, radius: Tensor, targets: range, inputs: bool, tilted: bool) -> Bounds:
+class _Asked(NamedTuple):
+    """See :func:`backward`."""
+
+    within: Array
+    targets: range
+    begin: int
+    states: bool
+    inputs: bool
+
+
+def _swept(steps: Steps, asked: _Asked, tilted: bool) -> Bounds:
     """All targets go back in one sweep; a target joins when the sweep comes by."""
-    n = radius.shape[-1]
-    sweep = _Sweep(steps.extents, radius.reshape(-1, n).numpy(), targets, inputs)
+    sweep, targets = _Sweep(steps.extents, asked), asked.targets
     joined: list[tuple[int, Inputs | None, int]] = []  # step, inputs (None: the state), rows
-    for k in range(targets.stop - 1, -1, -1):
+    for k in range(targets.stop - 1, asked.begin - 1, -1):
         step = steps[k]
-        if k in targets:
+        if asked.states and k in targets:
             joined.append((k, None, sweep.join_states()))
         sweep.enter(step)
         for r in reversed(step.replacements):
-            if r.lines is not None:
-                sweep.add(r.lines, sweep.scaled(r))
+            if r.coefficients is not None:
+                sweep.add(r)
             elif tilted and r.product is not None:
                 _tilt(sweep.head(r.first), sweep.scaled(r), r.product, step.shape, step.own)
             else:
                 sweep.keep(r)
-            if inputs and k in targets and r.inputs is not None:
+            if asked.inputs and k in targets and r.inputs is not None:
                 joined.append((k, r.inputs, sweep.join(r.inputs)))
         sweep.leave(step.rounding)
-    return _collected(sweep.upper(), joined, targets, steps.extents, radius.shape[:-1])
+    return _collected(sweep.upper(), joined, targets, steps.extents)
 
 
 class _Sweep:
@@ -105,18 +119,17 @@ class _Sweep:
 
     Args:
         extents: of the steps.
-        targets, inputs: as for :func:`backward`.
-        radius: of the start box, ``(B, n)``.
+        asked: what is bounded.
     """
 
-    def __init__(self, extents: Sequence[Extent], radius: Array, targets: range, inputs: bool) -> None:
-        cells, n = radius.shape
-        most = 2 * n * len(targets)
-        if inputs:
-            most += sum(extents[k].inputs for k in targets)
-        passed = extents[: targets.stop]
+    def __init__(self, extents: Sequence[Extent], asked: _Asked) -> None:
+        cells, n, _ = asked.within.shape
+        most = 2 * n * len(asked.targets) if asked.states else 0
+        if asked.inputs:
+            most += sum(extents[k].inputs for k in asked.targets)
+        passed = extents[asked.begin : asked.targets.stop]
         width, widest = max(e.height for e in passed), max(e.widest for e in passed)
-        self._radius, self._count = radius[:, None], 0
+        self._within, self._count = asked.within, 0
         self._constant, self._states = np.empty((cells, most)), np.empty((cells, n, most))
         self._values, self._scratch = np.empty((2, cells, width, most))
         self._parts = np.empty((cells, 2 * max(n, widest), most))
@@ -144,10 +157,19 @@ class _Sweep:
         assert r.inverse is not None
         return self._split(self._values[:, LEAD + r.first : LEAD + r.last, : self._count] * r.inverse)
 
-    def add(self, lines: Array, parts: Array) -> None:
-        """What lines make of them."""
-        made = np.matmul(lines, parts, out=self._scratch[:, : lines.shape[-2], : self._count])
-        head = self._values[:, : lines.shape[-2], : self._count]
+    def add(self, r: Replacement) -> None:
+        """What lines make of a replacement's coefficients: of each only one part is not 0, and one line is taken."""
+        assert r.coefficients is not None and r.lead is not None and r.tilts is not None
+        parts, (upper, lower) = self.scaled(r), r.tilts
+        lead = self._values[:, :LEAD, : self._count]
+        lead += r.lead @ parts
+        tilted, negative = np.split(parts, 2, axis=-2)
+        tilted *= upper
+        negative *= lower
+        tilted += negative
+        first = r.coefficients.shape[-2]
+        made = np.matmul(r.coefficients, tilted, out=self._scratch[:, :first, : self._count])
+        head = self._values[:, LEAD : LEAD + first, : self._count]
         np.add(head, made, out=head)
 
     def keep(self, r: Replacement) -> None:
@@ -174,16 +196,26 @@ class _Sweep:
         self._states[..., : self._count] = self._values[:, LEAD : LEAD + n, : self._count]
 
     def upper(self) -> Array:
-        """Upper bounds of all rows over the start box, ``(B, rows)``; infinite where there are none."""
-        n = self._states.shape[-2]
-        reach = (self._radius @ np.abs(self._states))[:, 0]
-        upper = self._constant + reach * at_least(n)
+        """Upper bounds of all rows over the set that they went back to, ``(B, rows)``; infinite where unknown."""
+        n, count = self._within.shape[-2:]
+        reach = np.zeros_like(self._constant)
+        for first in range(0, reach.shape[-1], _ROWS):
+            rows = slice(first, first + _ROWS)
+            reach[:, rows] = np.abs(self._within.mT @ self._states[..., rows]).sum(-2)
+        # A product of a generator and a row is off by its n roundings of the sizes of its terms.
+        sizes = (np.abs(self._within).sum(-1)[:, None] @ np.abs(self._states))[:, 0] * at_least(n + count)
+        reach = (reach + slack(sizes, n + 2)) * at_least(n + count)
+        upper = self._constant + reach
         upper += slack(np.abs(upper) + reach, 4)
         return np.nan_to_num(upper, nan=math.inf, posinf=math.inf, neginf=math.inf)
 
     def _split(self, rows: Array) -> Array:
         """Positive and negative parts one after the other, both not negative; valid until the next call."""
         return _split(rows, self._parts[:, : 2 * rows.shape[-2], : self._count])
+
+
+_ROWS = 1024
+"""Rows that are bounded at once."""
 
 
 def _split(rows: Array, out: Array) -> Array:
@@ -235,7 +267,6 @@ def _collected(
     joined: Sequence[tuple[int, Inputs | None, int]],
     targets: range,
     extents: Sequence[Extent],
-    batch: torch.Size,
 ) -> Bounds:
     """Upper bounds of rows and of minus the rows, as lower and upper bounds by step and operation."""
     states: list[Any] = [None] * len(targets)
@@ -250,10 +281,10 @@ def _collected(
         lower = np.full((len(upper), extents[k].entries[inputs.operations[0]]), -math.inf)
         higher = -lower
         lower[:, inputs.entries], higher[:, inputs.entries] = -low, high
-        bounds = tuple(torch.from_numpy(side).reshape(*batch, -1) for side in (lower, higher))
+        bounds = tuple(torch.from_numpy(side) for side in (lower, higher))
         for operation in inputs.operations:
             found[k - targets.start][operation] = bounds
-    lower, higher = (
-        torch.from_numpy(np.stack(side, axis=1)).reshape(*batch, len(targets), -1) for side in zip(*states, strict=True)
-    )
+    if None in states:
+        return Bounds(None, found)
+    lower, higher = (torch.from_numpy(np.stack(side, axis=1)) for side in zip(*states, strict=True))
     return Bounds((lower, higher), found)

@@ -87,7 +87,9 @@ class Replacement(NamedTuple):
         radius: of variables that are known only to lie in ``[-radius, radius]``, ``(B, 1, E)``; of a product's, if its
             planes are level.
         inverse: of variables with lines or planes, one over their scale, ``(B, E, 1)``.
-        lines: of these, ``(B, 2 + first, 2E)``.
+        lead: of lines, what they add to gain and magnitude, ``(B, 2, 2E)``.
+        tilts: by how much the upper and the lower lines are steeper than the band, ``(2, B, E, 1)``.
+        coefficients: of the operation's input, ``(B, first, E)``.
         product: planes instead of lines.
         inputs: the operation's, where they are not found with another's.
     """
@@ -96,7 +98,9 @@ class Replacement(NamedTuple):
     last: int
     radius: Array | None = None
     inverse: Array | None = None
-    lines: Array | None = None
+    lead: Array | None = None
+    tilts: Array | None = None
+    coefficients: Array | None = None
     product: Product | None = None
     inputs: Inputs | None = None
 
@@ -153,8 +157,9 @@ class _Stacked(NamedTuple):
         first, last: its variables.
         kept: which of them are variables of the backward pass, ``(steps, E)``; None: all.
         radius, inverse: as for :class:`Replacement`, ``(..., E)``.
-        lines: from positive and negative parts to gain, magnitude and earlier coefficients, ``(..., 2E, 2 + first)``.
-        input: the operation's input, and minus it, as such rows.
+        lead, tilt, coefficients: of lines, ``(..., 2E, 2)``, of positive and then of negative parts ``(..., 2E)``, and
+            ``(..., E, first)``.
+        input: the operation's input, and minus it, as rows ``(..., 2E, 2 + first)``.
         tilts, planes: of a product, as for :class:`Product`; planes are ``(..., 2E)`` by name.
     """
 
@@ -163,7 +168,9 @@ class _Stacked(NamedTuple):
     kept: Tensor | None = None
     radius: Tensor | None = None
     inverse: Tensor | None = None
-    lines: Tensor | None = None
+    lead: Tensor | None = None
+    tilt: Tensor | None = None
+    coefficients: Tensor | None = None
     input: Tensor | None = None
     tilts: Tensor | None = None
     planes: dict[str, Tensor] | None = None
@@ -258,7 +265,12 @@ class _Part:
         self._before, self._after = found_before, found_after
         self._radius = None if stacked.radius is None else stacked.radius[..., None, :].numpy()
         self._inverse = None if stacked.inverse is None else stacked.inverse[..., None].numpy()
-        self._lines = None if stacked.lines is None else variables.condensed(stacked.lines)
+        if stacked.lead is not None and stacked.tilt is not None and stacked.coefficients is not None:
+            gone = variables.gone(stacked.coefficients)
+            gone = (stacked.tilt.abs() * torch.cat([gone, gone], dim=-1))[..., None]
+            self._lead = (stacked.lead + gone).mT.contiguous().numpy()
+            self._tilt = torch.stack(stacked.tilt.chunk(2, dim=-1), dim=1)[..., None].numpy()
+            self._coefficients = stacked.coefficients.mT.contiguous().numpy()
         self._input = None if stacked.input is None else variables.condensed(stacked.input)
         if stacked.tilts is not None and stacked.planes is not None:
             gone = variables.gone(stacked.tilts)
@@ -280,14 +292,23 @@ class _Part:
             tilts = self._tilts[k][..., self._variables.index[k][:first]]
             planes = {name: part[k] for name, part in self._planes.items()}
             return Replacement(first, last, radius, self._inverse[k], product=Product(tilts, self._likely[k], **planes))
-        assert self._lines is not None and self._inverse is not None and self._input is not None
+        assert self._inverse is not None and self._input is not None
         entries = np.flatnonzero(s.kept[k].numpy())
-        part = (slice(None), *np.ix_(rows[: LEAD + first], np.concatenate([entries, entries + (s.last - s.first)])))
+        twice = np.concatenate([entries, entries + (s.last - s.first)])
         inputs = None
         if self._before is None or not self._before[k]:
             both = self._after is not None and self._after[k]
-            inputs = Inputs(self._input[k][part], (operation, operation + 1) if both else (operation,), entries)
-        return Replacement(first, last, None, self._inverse[k][:, entries], self._lines[k][part], inputs=inputs)
+            wanted = self._input[k][:, rows[: LEAD + first, None], twice]
+            inputs = Inputs(wanted, (operation, operation + 1) if both else (operation,), entries)
+        return Replacement(
+            first,
+            last,
+            inverse=self._inverse[k][:, entries],
+            lead=self._lead[k][..., twice],
+            tilts=self._tilt[k][:, :, entries],
+            coefficients=self._coefficients[k][:, self._variables.index[k][:first, None], entries],
+            inputs=inputs,
+        )
 
 
 _OF_TILTS = ("magnitude", "rounding")
@@ -329,7 +350,6 @@ def _operation(group: list[Relaxed], cells: int) -> _Stacked:
     tilt, value = torch.cat([up, down], dim=-1), torch.cat([above_value, below_value], dim=-1)
     twice = torch.cat([magnitude, magnitude], dim=-1)
     lead = torch.stack([value, tilt.abs() * twice + value.abs()], dim=-1)
-    lines = torch.cat([lead, tilt[..., None] * torch.cat([coefficients, coefficients], dim=-2)], dim=-1)
     carried = magnitude * (error * SAFETY)
     linear = radius <= LINEAR * (slope.abs() * magnitude + offset.abs())
     return _Stacked(
@@ -337,7 +357,9 @@ def _operation(group: list[Relaxed], cells: int) -> _Stacked:
         last,
         kept=~linear.all(1),
         inverse=1.0 / radius,
-        lines=lines,
+        lead=lead,
+        tilt=tilt,
+        coefficients=coefficients,
         input=_signed(carried, magnitude, coefficients),
     )
 

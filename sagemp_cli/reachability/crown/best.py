@@ -18,7 +18,7 @@ from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.affine.compiled.hints import Hints
 from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.blocks import in_blocks
-from sagemp_cli.reachability.crown.crown import Crown, cells_at_once, taken_back, taking_back
+from sagemp_cli.reachability.crown.crown import TOGETHER, Crown, cells_at_once, taken_back, taking_back
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import NUMBER, Footprint, Loop, LoopSize, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
@@ -63,7 +63,7 @@ class Best(Propagator):
         for n in range(self.rounds):
             run = affine.run(loop, start, disturbance, keep_steps=True, hints=hints)
             back, found = taken_back(run, start, rows=self.rows, inputs=n + 1 < self.rounds)
-            hints = found if hints is None else _sharper(hints, found)
+            hints = _sharper(hints, found) if hints and found else hints or found
             tubes += [run.tube, back]
             notes = run.notes
         lower, upper = (torch.stack(sides) for sides in zip(*((t.lower, t.upper) for t in tubes), strict=True))
@@ -71,7 +71,7 @@ class Best(Propagator):
 
     def footprint(self, size: LoopSize) -> Footprint:
         """That of CROWN, and the bounds of all operations' inputs."""
-        rows = min(self.rows, 2 * size.steps * size.variables)
+        rows = min(self.rows, max(2 * size.steps * size.states, 2 * TOGETHER * size.variables))
         crown = taking_back(self.symbols, rows, size)
         assert crown.working is not None
         return Footprint(crown.working + 4 * NUMBER * size.steps * size.entries, crown.kept)

@@ -30,6 +30,12 @@ from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.rounding import slack
 
+BACK = 12
+"""Steps that the inputs of operations go back, at least: farther hardly sharpens them, and takes as much time again."""
+
+TOGETHER = 4
+"""Steps whose inputs go back together."""
+
 AT_ONCE = 2**29
 """Bytes that cells which are bounded together may take; of one cell, if it takes more."""
 
@@ -104,22 +110,33 @@ def taken_back(run: AffineRun, start: Box, *, rows: int, inputs: bool = False) -
         rows: most rows at once for one cell; at least one step's are taken.
         inputs: whether the operations' inputs are bounded too.
     """
-    steps = Steps(run.steps)
-    joining = 2 * start.dim
-    if inputs:
-        joining += max(extent.inputs for extent in steps.extents)
-    size = max(1, rows // joining)
-    lowers, uppers, hints = [start.lower[..., None, :]], [start.upper[..., None, :]], []
+    steps, n = Steps(run.steps), start.dim
+    box = torch.diag_embed(start.radius.reshape(-1, n)).numpy()
+    size = max(1, rows // (2 * n))
+    lowers, uppers = [start.lower[..., None, :]], [start.upper[..., None, :]]
     for first in range(0, len(steps), size):
         some = run.steps[first : first + size]
-        found = backward(steps, start.radius, targets=range(first, first + len(some)), inputs=inputs)
+        found = backward(steps, box, targets=range(first, first + len(some))).state
+        assert found is not None
         centers = torch.from_numpy(np.stack([step.after.both[0] for step in some], axis=1))
-        lower, upper = _placed(centers.reshape(found.state[0].shape), *found.state)
-        lowers.append(lower)
-        uppers.append(upper)
-        for step, bounds in zip(some, found.inputs, strict=True):
+        for sides, side in zip((lowers, uppers), _placed(centers, *found), strict=True):
+            sides.append(side.reshape(*start.lower.shape[:-1], len(some), n))
+    tube = Tube(torch.cat(lowers, dim=-2), torch.cat(uppers, dim=-2))
+    return tube, _inputs(steps, run, box, rows) if inputs else []
+
+
+def _inputs(steps: Steps, run: AffineRun, box: np.ndarray, rows: int) -> list[Hints]:
+    """Bounds of all operations' inputs: they go back a few steps, to the sets of the forward pass."""
+    size = max(1, min(TOGETHER, rows // max(1, *(extent.inputs for extent in steps.extents))))
+    hints: list[Hints] = []
+    for first in range(0, len(steps), size):
+        some, begin = run.steps[first : first + size], max(0, first - BACK)
+        within = run.steps[begin].within if begin else box
+        targets = range(first, first + len(some))
+        found = backward(steps, within, targets=targets, begin=begin, states=False, inputs=True).inputs
+        for step, bounds in zip(some, found, strict=True):
             hints.append([_hint(*pair) for pair in zip(step.relaxed, bounds, strict=True)])
-    return Tube(torch.cat(lowers, dim=-2), torch.cat(uppers, dim=-2)), hints
+    return hints
 
 
 def _hint(operation: Relaxed, bounds: tuple[Tensor, Tensor] | None) -> Hint:

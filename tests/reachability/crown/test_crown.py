@@ -10,10 +10,12 @@ from inner import attack_tube
 from sagemp_cli.errors import ConfigError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.affine.compiled import arrays, operations
+from sagemp_cli.reachability.affine.compiled.steps import GENERATORS
 from sagemp_cli.reachability.crown import backward_steps
 from sagemp_cli.reachability.crown import crown as crown_module
 from sagemp_cli.reachability.crown import steps as steps_module
-from sagemp_cli.reachability.crown.backward import _swept, _tilt, backward
+from sagemp_cli.reachability.crown.backward import _Asked, _swept, _tilt, backward
 from sagemp_cli.reachability.crown.backward_steps import Product, Step
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
@@ -25,6 +27,7 @@ from sagemp_cli.reachability.program.loops import RecordedLoop, record
 from sagemp_cli.reachability.relaxations.band import Band
 from sagemp_cli.reachability.relaxations.lines import parallel
 from sagemp_cli.sets import Box
+from sagemp_cli.sets.partition import partition
 
 from ..propagator_cases import DISTURBANCE, START, AffineLoop, EveryOperation, line, unicycle_loop
 
@@ -40,7 +43,8 @@ def test_level_planes_and_lines_parallel_to_the_bands_are_affine_arithmetic(monk
         (EveryOperation(), Box.around([0.1, -0.05, 0.2], [0.1] * 3), Box.around([0.0] * 3, [0.01] * 3)),
     ):
         run = Affine().run(loop, start, w, keep_steps=True, intervals=False)
-        low, high = _swept(Steps(run.steps), start.radius, range(loop.horizon), False, False).state
+        asked = _Asked(torch.diag_embed(start.radius)[None].numpy(), range(loop.horizon), 0, True, False)
+        low, high = (side[0] for side in _swept(Steps(run.steps), asked, False).state)
         torch.testing.assert_close(high - low, run.tube.width[1:], rtol=1e-7, atol=1e-12)
 
 
@@ -96,12 +100,13 @@ def broken(step: Step, kind: str) -> Step:
     changed = []
     for r in step.replacements:
         entries = r.last - r.first
-        if kind == "upper and lower lines exchanged" and r.lines is not None:
-            r = r._replace(lines=np.concatenate([r.lines[..., entries:], r.lines[..., :entries]], axis=-1))
-        if kind == "slopes of lines reversed" and r.lines is not None:
-            r = r._replace(lines=np.concatenate([r.lines[:, :2], -r.lines[:, 2:]], axis=-2))
-        if kind == "offsets of lines halved" and r.lines is not None:
-            r = r._replace(lines=np.concatenate([0.5 * r.lines[:, :2], r.lines[:, 2:]], axis=-2))
+        if kind == "upper and lower lines exchanged" and r.lead is not None:
+            lead = np.concatenate([r.lead[..., entries:], r.lead[..., :entries]], axis=-1)
+            r = r._replace(lead=lead, tilts=r.tilts[::-1])
+        if kind == "slopes of lines reversed" and r.lead is not None:
+            r = r._replace(tilts=-r.tilts)
+        if kind == "offsets of lines halved" and r.lead is not None:
+            r = r._replace(lead=0.5 * r.lead)
         if kind == "planes too low" and r.product is not None:
             r = r._replace(product=r.product._replace(top=0.2 * r.product.top), radius=0.2 * r.radius)
         changed.append(r)
@@ -207,6 +212,65 @@ def test_as_many_steps_go_back_in_one_sweep_as_the_rows_allow(rows, sweeps, monk
     loop = ClosedLoop(loop.dynamics, loop.tracker, loop.references[:11])
     Crown(rows=rows).propagate(loop, START, DISTURBANCE)
     assert len(known) == sweeps and [k for targets in known for k in targets] == list(range(10))
+
+
+def test_inputs_go_back_a_few_steps_to_sets_that_hold_the_states(monkeypatch):
+    """Not to the start box: their bounds hold on simulated rollouts, and are nearly those of going back all the way."""
+    loop = unicycle_loop(line(0.3), gain=0.8)
+    monkeypatch.setattr(crown_module, "TOGETHER", 2)
+    found = {}
+    for back in (1, 3, 100):
+        monkeypatch.setattr(crown_module, "BACK", back)
+        found[back] = Best().propagate(loop, START, DISTURBANCE)
+        tube = found[back]
+        attack = attack_tube(loop, START, DISTURBANCE, tube, count=400, generator=torch.Generator().manual_seed(4))
+        assert attack.escapes == 0
+    width = {back: float(tube.width.mean()) for back, tube in found.items()}
+    affine = float(Affine().propagate(loop, START, DISTURBANCE).width.mean())
+    assert width[100] <= width[3] * (1 + 1e-9) <= width[1] * (1 + 1e-8) < affine
+    assert width[3] - width[100] < 0.2 * (affine - width[100])
+
+
+def test_the_sets_that_rows_go_back_to_hold_all_simulated_states():
+    loop, generator = unicycle_loop(line(0.3), gain=0.8), torch.Generator().manual_seed(0)
+    run = Affine().run(loop, START, DISTURBANCE, keep_steps=True)
+    w = DISTURBANCE.sample(500 * loop.horizon, generator).unflatten(0, (500, loop.horizon))
+    w = torch.where(w > 0, DISTURBANCE.upper, DISTURBANCE.lower)
+    x = torch.where(START.sample(500, generator) > START.center, START.upper, START.lower)
+    states, _ = loop.rollout(x, w)
+    directions = torch.randn(64, 4, dtype=torch.float64, generator=generator).numpy()
+    for k in range(1, loop.horizon):
+        away = states[:, k].numpy() - run.steps[k - 1].after.both[0][0]
+        within = run.steps[k].within[0]
+        assert within.shape[1] <= GENERATORS * 4
+        assert (np.abs(away @ directions.T).max(0) <= np.abs(directions @ within).sum(1)).all()
+
+
+@pytest.mark.parametrize("cells", [1, 3])
+def test_where_a_rougher_bound_shows_a_neurons_sign_the_tube_is_the_same(cells, monkeypatch):
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        network = torch.nn.Sequential(
+            torch.nn.Linear(2, 64),
+            torch.nn.ReLU(),
+            torch.nn.Linear(64, 64),
+            torch.nn.LeakyReLU(),
+            torch.nn.Linear(64, 1),
+        ).double()
+    loop = record(
+        lambda x, w: torch.stack([x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * torch.sin(x[0]) - 0.1 * network(x)[0] + w[0]]),
+        torch.zeros(2, dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
+    known = RecordedLoop((loop,), torch.zeros(30, 0, dtype=torch.float64), 30)
+    start = partition(Box.around([0.3, 0.0], [0.3, 0.2]), [cells, 1])
+    tubes = []
+    for wide in (48, 10**6):
+        monkeypatch.setattr(operations, "WIDE", wide)
+        monkeypatch.setattr(arrays, "WIDE", wide)
+        tubes.append(Affine().propagate(known, start, Box.around([0.0], [0.01])))
+    torch.testing.assert_close(tubes[0].lower, tubes[1].lower, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(tubes[0].upper, tubes[1].upper, rtol=1e-12, atol=1e-13)
 
 
 def test_wrong_options_are_refused_in_one_line():

@@ -30,6 +30,27 @@ def with_fresh(coefficients: Any, factor: Any, size: int, radius: Any) -> Any:
     return out
 
 
+def applied(matrix: Any, coefficients: Any, fresh: Any) -> Any:
+    """``matrix @ coefficients``, of which the last columns are a diagonal if it is known, ``(B, e)``.
+
+    Args:
+        matrix: ``(rows, e)``.
+        coefficients: ``(B, e, variables)``.
+        fresh: the diagonal; None if there is none.
+    """
+    if fresh is None or not isinstance(fresh, np.ndarray) or fresh.shape[-1] < WIDE:
+        return matrix @ coefficients
+    (cells, entries), variables = fresh.shape, coefficients.shape[-1]
+    out = np.empty((cells, len(matrix), variables))
+    np.matmul(matrix, coefficients[..., :-entries], out=out[..., :-entries])
+    np.multiply(matrix, fresh[:, None], out=out[..., -entries:])
+    return out
+
+
+WIDE = 48
+"""Entries from which on a diagonal is worth a call of its own."""
+
+
 def added(total: Any, part: Any) -> Any:
     """The sum of coefficients, of which the second may have fewer variables; the first is used up."""
     if total is None:

@@ -43,11 +43,14 @@ class Value(NamedTuple):
         both: centre and magnitude, ``(2, B, e)``.
         coefficients: ``(B, e, variables)``, or for all cells ``(1, e, variables)``.
         error: relative rounding error.
+        fresh: of the last e variables, of which each entry has one of its own, the coefficients, ``(B, e)``; None if it
+            is not so.
     """
 
     both: Array
     coefficients: Array
     error: float
+    fresh: Array | None = None
 
 
 class Factors(NamedTuple):
@@ -227,6 +230,26 @@ class Frame:
         radius = self.reach(x)
         return x.both[0] - radius, x.both[0] + radius
 
+    def bounds_at_kinks(self, x: Value) -> tuple[Array, Array]:
+        """The same, but of entries that a rougher bound already shows to keep one sign in all cells that rougher one.
+
+        Sums over all symbols are most of the time of a wide layer, and most of its neurons' signs are known without.
+        """
+        few = len(x.both[0][0]) < WIDE or self.states.order < 4 * self.states.dim
+        if few or not isinstance(x.coefficients, np.ndarray):
+            return self.bounds(x)
+        n = self.states.dim
+        own = abs(x.coefficients[..., n:])
+        sizes = self.own_radius[..., : own.shape[-1]]
+        of_own = own @ sizes if sizes.ndim == 1 else (own * sizes).sum(-1)
+        rough = (abs(x.coefficients[..., :n]) @ self.states.reach[..., None])[..., 0] + of_own + self.slack(x)
+        lower, upper = x.both[0] - rough, x.both[0] + rough
+        open_ones = ~((lower >= 0) | (upper <= 0)).all(0)
+        if open_ones.any():
+            some = Value(x.both[..., open_ones], x.coefficients[:, open_ones], x.error)
+            lower[:, open_ones], upper[:, open_ones] = self.bounds(some)
+        return lower, upper
+
     def operand_bounds(self, x: Value) -> tuple[Array, Array]:
         """Bounds of the operand, or the first operands, of the operation whose turn it is: by form and by interval."""
         return self.both_hold(*self.bounds(x))
@@ -250,7 +273,7 @@ class Frame:
         self.relaxed.append(relaxed)
         coefficients = with_fresh(coefficients, factor, self.size, relaxed.radius)
         self.size += relaxed.radius.shape[-1]
-        return Value(self._m.stack([center, magnitude + relaxed.radius]), coefficients, BAND)
+        return Value(self._m.stack([center, magnitude + relaxed.radius]), coefficients, BAND, relaxed.radius)
 
 
 def noticeably(node: Node, lower: Array, upper: Array, low: Array, high: Array) -> Array:
@@ -284,7 +307,8 @@ def _function(node: Node, frame: Frame, x: Value) -> Value:
     """A function of one variable: its band over the operand's bounds."""
     assert node.relaxation is not None
     name, operation, parameters = node.relaxation
-    lower, upper = _narrowed(*frame.operand_bounds(x), frame.hint(name, node.size))
+    bounds = frame.bounds_at_kinks(x) if name in ONE_KINK else frame.bounds(x)
+    lower, upper = _narrowed(*frame.both_hold(*bounds), frame.hint(name, node.size))
     return enclosed(node, frame, Bounded(x, lower, upper, operation.band_of(lower, upper, *parameters)))
 
 
@@ -474,6 +498,10 @@ def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     return enclosed(node, frame, Bounded(across, lower, upper, band, given, turn))
 
 
+ONE_KINK = ("relu", "leaky_relu")
+"""Functions that are linear on either side of 0: of which side it is nothing more has to be known."""
+WIDE = 48
+"""Entries of an operation from which on signs are looked for first."""
 KINKED = ("relu", "leaky_relu", "clamp", "abs")
 NOTICEABLE_AT_A_KINK, NOTICEABLE = 0.9, 0.65
 """What part of a form's width an operand's interval has at most where it is worth the time: errors at a kink are of

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.affine.compiled.arrays import added, repeated
+from sagemp_cli.reachability.affine.compiled.arrays import added, applied, repeated
 from sagemp_cli.reachability.affine.compiled.folding import Combination, Compiled, Node, compiled
 from sagemp_cli.reachability.affine.compiled.hints import Hints
 from sagemp_cli.reachability.affine.compiled.intervals import Carried, Intervals
@@ -377,7 +377,7 @@ class _Fold:
         for i, matrix, sided in self._of_results:
             both = both + results[i].both @ sided
             error = max(error, results[i].error)
-            coefficients = added(coefficients, matrix @ results[i].coefficients)
+            coefficients = added(coefficients, applied(matrix, results[i].coefficients, results[i].fresh))
         if coefficients is None:
             coefficients = self._direct
         elif self._direct is not None:

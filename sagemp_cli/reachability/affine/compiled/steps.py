@@ -11,6 +11,9 @@ from sagemp_cli.sets.rounding import TINY
 
 Array = np.ndarray
 
+GENERATORS = 24
+"""Generators that are kept of a set, per state."""
+
 
 class KeptStep(NamedTuple):
     """A step of arrays without its generators, which would be most of it.
@@ -18,6 +21,7 @@ class KeptStep(NamedTuple):
     Attributes:
         relaxed: the operations, in the order of evaluation.
         own_radius: radii of all variables but the states, ``(variables - n,)``.
+        within: generators of a set that the state's deviations lie in, few of them, ``(B, n, m)``.
         ellipsoid: the shape matrix of the symbols, scaled to the extent of the set's box, ``(B, n, n)``; no enclosure,
             but enough where a guess is.
         after: the next state.
@@ -26,6 +30,7 @@ class KeptStep(NamedTuple):
 
     relaxed: list[Relaxed]
     own_radius: Array
+    within: Array
     ellipsoid: Array
     after: Value
     rounding: Array
@@ -38,4 +43,5 @@ class KeptStep(NamedTuple):
         scale = states.reach / (np.sqrt(np.diagonal(square, axis1=-2, axis2=-1)) + TINY)
         ellipsoid = square * scale[..., None] * scale[..., None, :]
         own = frame.own_radius[: frame.size - states.dim]
-        return KeptStep(frame.relaxed, own, ellipsoid, after, frame.rounding(after))
+        within = states.reduce_order(GENERATORS * states.dim)[0].generators
+        return KeptStep(frame.relaxed, own, within, ellipsoid, after, frame.rounding(after))
