@@ -4,7 +4,8 @@
 
 Takes every ``certificate.h5`` below the artifacts folder that is in continuous time. Starts are corners and points of
 its cells; signals of w are vertices of W, held, switched at random, or switched at 1 to 64 times the sample rate, in
-all states together or in each by itself. The ODE is integrated by the classical Runge-Kutta method in 64 parts of a
+all states together or in each by itself; of a control that lags delays and jitters are random and, at every other
+instant, as small or as large as may be. The ODE is integrated by the classical Runge-Kutta method in 64 parts of a
 period;
 compared are the states at the instants with the tube, and those between with the box that the flow does not leave and
 with the straight lines and their bulges. A difference of :data:`MARGIN` is granted to the integrator. Ends with exit
@@ -21,6 +22,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from sagemp_cli.dynamics import Dynamics
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.pipeline.models import tracker_from
 from sagemp_cli.pipeline.problem import problem_of
@@ -50,6 +52,22 @@ def signals(w: Box, periods: int, count: int, generator: torch.Generator) -> Ten
     return torch.stack(found)
 
 
+def _solved(robot: Dynamics, x: Tensor, u: Tensor, w: Tensor, h: Tensor | float) -> Tensor:
+    """The state some seconds later."""
+    a = robot.derivative(x, u) + w
+    b = robot.derivative(x + h / 2 * a, u) + w
+    c = robot.derivative(x + h / 2 * b, u) + w
+    return x + h / 6 * (a + 2 * b + 2 * c + robot.derivative(x + h * c, u) + w)
+
+
+def _measured(robot: Dynamics, past: list[tuple[Tensor, Tensor]], held: Tensor, older: Tensor) -> Tensor:
+    """The state some seconds before the end of a period, from the last of its parts that began before."""
+    h, row = robot.dt / FINE, torch.arange(len(older))
+    place = ((robot.dt - older) / h).floor().clamp(max=FINE - 1).long()
+    x, w = (torch.stack(side)[place, row] for side in zip(*past, strict=True))
+    return _solved(robot, x, held, w, (robot.dt - older - place * h)[:, None])
+
+
 def outside(path: Path, rollouts: int, generator: torch.Generator) -> tuple[int, float]:
     """How many solutions of how a certificate's first reference moves leave what it says, and by how much at worst."""
     artifact = read_artifact(path, Certificate)
@@ -62,6 +80,7 @@ def outside(path: Path, rollouts: int, generator: torch.Generator) -> tuple[int,
     assert tubes.flow is not None
     ((_, flow),), w = flows_of(tubes.flow, tube), problem.disturbance
     lines, bulge = flow.lines(tube, w, loop.period)
+    swing = bulge.swing.expand_as(bulge.curve)
     parts = flow.division.substeps
     per, h = FINE // parts, loop.period / FINE
     bad, worst, done = 0, -torch.inf, 0
@@ -77,22 +96,29 @@ def outside(path: Path, rollouts: int, generator: torch.Generator) -> tuple[int,
         def compare(x: Tensor, low: Tensor, high: Tensor, most: Tensor) -> Tensor:
             return torch.maximum(most, torch.maximum(low - x, x - high).amax(-1))
 
+        held, past, late = None, [], problem.dynamics.lag.box
         for k in range(loop.horizon):
-            u = loop.control(k, x)
+            seconds = late.sample(count, generator) if k else torch.zeros(count, 2, dtype=torch.float64)
+            if k % 2:  # every other instant as early or as late as may be
+                seconds = torch.where(seconds > late.center, late.upper, late.lower)
+            u = loop.control(k, x if held is None else _measured(problem.dynamics, past, held, seconds[:, 1]))
+            past, held = [], u if held is None else held
             for i in range(FINE):
                 part, s = i // per, (i % per) / per
                 row = k * parts + part
                 most = compare(x, flow.lower[cell, k, part], flow.upper[cell, k, part], most)
-                off = s * (1 - s) * (bulge.curve[cell, row] + bulge.swing[row]) + bulge.rest[cell, row]
+                off = s * (1 - s) * (bulge.curve[cell, row] + swing[cell, row]) + bulge.rest[cell, row]
                 low = (1 - s) * lines.lower[cell, row] + s * lines.lower[cell, row + 1] - off
                 high = (1 - s) * lines.upper[cell, row] + s * lines.upper[cell, row + 1] + off
                 most = compare(x, low, high, most)
                 v = signal[:, k * FINE + i]
-                a = problem.dynamics.derivative(x, u) + v
-                b = problem.dynamics.derivative(x + h / 2 * a, u) + v
-                c = problem.dynamics.derivative(x + h / 2 * b, u) + v
-                d = problem.dynamics.derivative(x + h * c, u) + v
-                x = x + h / 6 * (a + 2 * b + 2 * c + d)
+                past.append((x, v))
+                if problem.dynamics.lag:
+                    old = (seconds[:, :1] - i * h).clamp(0.0, h)
+                    x = _solved(problem.dynamics, _solved(problem.dynamics, x, held, v, old), u, v, h - old)
+                else:
+                    x = _solved(problem.dynamics, x, u, v, h)
+            held = u
             most = compare(x, tube.lower[cell, k + 1], tube.upper[cell, k + 1], most)
         bad += int((most > MARGIN).sum())
         worst, done = max(worst, float(most.max())), done + count

@@ -29,3 +29,8 @@ class Problem:
     disturbance: Box
     horizon: int
     between: Between = Between.SEGMENTS
+
+    @property
+    def unknowns(self) -> Box:
+        """What is unknown of every step: :meth:`~sagemp_cli.dynamics.base.Dynamics.unknowns`."""
+        return self.dynamics.unknowns(self.disturbance)

@@ -10,7 +10,7 @@ import numpy as np
 from sagemp_cli.checker.balls import BITS, arb, ball, balls, ctx
 from sagemp_cli.checker.loop import Folded, Loop
 from sagemp_cli.checker.ode import Flow
-from sagemp_cli.checker.part import FlowClaim, PartProver
+from sagemp_cli.checker.part import Before, FlowClaim, PartProver
 from sagemp_cli.checker.requirement import MarginProver, Required
 from sagemp_cli.checker.step import Entry, Step
 from sagemp_cli.checker.unproved import Unproved
@@ -73,7 +73,10 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flows: Sequence[Flo
             w = claim.disturbance_lower, claim.disturbance_upper
             loops = {i: Loop(programs[i], claim.windows, *w) for i in set(claim.program.tolist())}
             parts = _Parts(claim, flows[claim.program[0]], *w) if flows else None
-            states, box = Zonotope.box(claim.lower, claim.upper), _box(claim.lower, claim.upper)
+            n = len(claim.lower)
+            before = np.zeros(programs[claim.program[0]].program.states - n)  # of a lag: as yet nothing
+            corners = [np.concatenate([side, before]) for side in (claim.lower, claim.upper)]
+            states, box = Zonotope.box(*corners), _box(*corners)
             if not ((claim.tube_lower[0] <= claim.lower) & (claim.upper <= claim.tube_upper[0])).all():
                 raise Unproved("the tube does not contain the cell")
             for k, which in enumerate(claim.program.tolist()):
@@ -87,7 +90,7 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flows: Sequence[Flo
                 m = claim.control_lower.shape[1]
                 _require_inside(asked[:m], claim.control_lower[k], claim.control_upper[k], "control")
                 if parts is not None:
-                    parts.prove(k, box, asked[:m], asked[m:])
+                    parts.prove(k, box, asked)
                 if claim.deviation is not None:
                     if deviation is None:
                         raise Unproved("the program has no deviation")
@@ -97,9 +100,9 @@ def prove_cell(claim: CellClaim, programs: Sequence[Folded], flows: Sequence[Flo
                 box = step.output(folded.program.next, states.bounds())
                 if claim.kept is not None:
                     states = states.reduced(_mask(claim.kept[k], states.generators.shape[1]))
-                _require_inside(box, claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
+                _require_inside(box[:n], claim.tube_lower[k + 1], claim.tube_upper[k + 1], "state")
                 if parts is not None:
-                    parts.require(k, box)
+                    parts.require(k, box[:n])
         except (Unproved, ArithmeticError) as e:
             return f"step {k}: {e}"
     return ""
@@ -111,34 +114,53 @@ class _Parts:
     Args:
         claim: of the cell.
         flow: the loop's programs.
-        lower, upper: what every period is given, of which W comes first.
+        lower, upper: what every period is given.
     """
 
     def __init__(self, claim: CellClaim, flow: Flow, lower: np.ndarray, upper: np.ndarray) -> None:
         if claim.flow is None:
             raise Unproved("nothing is said of the flow between the instants")
-        w = lower[0, : flow.rate.states], upper[0, : flow.rate.states]
-        self._flow, self._count, self._prover = claim.flow, flow.substeps, PartProver(flow, *w)
+        n = flow.rate.states
+        first = 1 + 2 * n if flow.jitters else 0  # of the first mean of w
+        w = lower[0, first : first + n], upper[0, first : first + n]
+        self._ode, self._flow, self._count, self._prover = flow, claim.flow, flow.substeps, PartProver(flow, *w)
         self._required = [(MarginProver(one, flow, *w), margin) for one, margin in claim.required]
         self._begins: list[list[Bounds]] = []
         self._insides: list[list[Bounds]] = []
         self._control: list[Bounds] = []
 
-    def prove(self, k: int, begin: list[Bounds], control: list[Bounds], inner: list[Bounds]) -> None:
-        """The flow of period k; ``inner`` bounds the states at the beginning of parts 2 to S.
+    def prove(self, k: int, box: list[Bounds], asked: list[Bounds]) -> None:
+        """The flow of period k.
+
+        Args:
+            k: which period.
+            box: bounds of the state at its beginning and, of a control that lags, of the control before.
+            asked: bounds of the control, of the states at the beginning of parts 2 to S and, of a control that lags, of
+                what it changes the rate by in each part that it may be late in, and of what it changes itself.
 
         Raises:
             Unproved: it does not follow.
         """
-        n, flow = len(begin), self._flow
+        ode, flow, lag = self._ode, self._flow, self._ode.lag
+        n, m = ode.rate.states, ode.controls
+        control, begin, held = asked[:m], box[:n], box[n:]
+        inner, jumps, less = _cut(asked[m:], [n * (ode.substeps - 1), n * ode.lagged])
+        if lag is not None and ode.jitters and k:
+            self._prover.measured(flow, k, lag.since(ode.period, ode.substeps), held)
         self._begins, self._control, self._insides = [begin], control, []
         for j in range(self._count):
             if j:
                 begin = inner[(j - 1) * n : j * n]
                 _require_inside(begin, flow.inner_lower[k, j - 1], flow.inner_upper[k, j - 1], f"part {j}: state")
                 self._begins.append(begin)
+            before = None
+            if lag is not None and k and j < ode.lagged:
+                both = [(a.min(c), b.max(d)) for (a, b), (c, d) in zip(control, held, strict=True)]
+                least, most = (arb(s.numerator) / s.denominator for s in lag.share(j, ode.period, ode.substeps))
+                weight = ball(max(side[1] for side in lag.means(j, ode.period, ode.substeps)))
+                before = Before(both, jumps[j * n : (j + 1) * n], less, (least, most), weight)
             try:
-                self._insides.append(self._prover.prove(flow, (k, j), begin, control))
+                self._insides.append(self._prover.prove(flow, (k, j), begin, control, before))
             except Unproved as e:
                 raise Unproved(f"part {j}: {e}") from None
 
@@ -160,6 +182,15 @@ class _Parts:
                         f"part {j}: the margin of '{prover.required.name}' is only proved to be {float(found):.9g}, "
                         f"the file says {margin:.9g}"
                     )
+
+
+def _cut(values: list[Bounds], sizes: Sequence[int]) -> list[list[Bounds]]:
+    """Some in a row, and the rest."""
+    found = []
+    for size in sizes:
+        found.append(values[:size])
+        values = values[size:]
+    return [*found, values]
 
 
 def _record(claim: CellClaim, k: int, folded: Folded) -> list[Entry]:

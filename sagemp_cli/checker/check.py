@@ -344,6 +344,13 @@ def _claim(document: Document, c: int) -> CellClaim:
     tubes, found = document.tubes, document.relaxations
     r = tubes["cell_reference"][c]
     margins = _margins(document, r)
+    flow = document.flow_of(c) if document.odes else None
+    w = tubes["disturbance_lower"], tubes["disturbance_upper"]
+    if flow is None:
+        sides = tuple(np.broadcast_to(side, (document.horizon, len(side))) for side in w)
+    else:  # of each part two means in W and a remainder, and what a lag needs
+        rest, measured = ((flow[f"{name}_lower"], flow[f"{name}_upper"]) for name in ("remainder", "measured"))
+        sides = document.odes[document.cell_ode[c]].given(w, rest, measured)
     return CellClaim(
         program=np.full(document.horizon, document.cell_ode[c]) if document.odes else document.step_program,
         windows=document.windows(r),
@@ -353,26 +360,16 @@ def _claim(document: Document, c: int) -> CellClaim:
         tube_upper=tubes["tube_upper"][c],
         control_lower=tubes["control_lower"][r],
         control_upper=tubes["control_upper"][r],
-        disturbance_lower=_disturbance(document, c, "lower"),
-        disturbance_upper=_disturbance(document, c, "upper"),
+        disturbance_lower=sides[0],
+        disturbance_upper=sides[1],
         slope=found["slope"][c],
         offset=found["offset"][c],
         radius=found["radius"][c],
         kept=found["kept"][c] if "kept" in found else None,
         deviation=None if document.deviation is None else document.deviation[r],
-        flow=FlowClaim(**document.flow_of(c)) if document.odes else None,
+        flow=None if flow is None else FlowClaim(**flow),
         required=tuple((one, margins[one.name]) for one in document.requirements),
     )
-
-
-def _disturbance(document: Document, c: int, side: str) -> np.ndarray:
-    """A side of what steps are given, ``(K, d)``: W; in continuous time of each part two means in W and a remainder."""
-    w = document.tubes[f"disturbance_{side}"]
-    if not document.odes:
-        return np.broadcast_to(w, (document.horizon, len(w)))
-    rest = document.flow_of(c)[f"remainder_{side}"]
-    mean = np.broadcast_to(w, rest.shape)
-    return np.concatenate([mean, mean, rest], axis=-1).reshape(document.horizon, -1)
 
 
 def _finding(

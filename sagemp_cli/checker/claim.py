@@ -21,6 +21,7 @@ from sagemp_cli.checker.equations import (
     matrix_of,
     rate_equations,
 )
+from sagemp_cli.checker.lag import Lag
 from sagemp_cli.checker.ode import Flow
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.requirement import Required
@@ -101,11 +102,25 @@ def _ode(document: Document, ode: Flow) -> list[tuple[str, str]]:
     (control,) = document.programs
     if control.control >= 0:
         chain = _chain(control, sorted(_behind(control, control.control)))
-        rows.append(("control", f"of x(t_k) at t_k = k dt, held on [t_k, t_k + dt]; {chain}"))
+        rows.append(("control", f"{_held(ode.lag)}; {chain}"))
         rows.append(
             ("control program", f"sha256 {control.fingerprint()[:16]}, its equations: sagemp inspect --equations")
         )
     return rows
+
+
+def _held(lag: Lag | None) -> str:
+    """When the control is measured, and when it is in force."""
+    if lag is None:
+        return "of x(t_k) at t_k = k dt, held on [t_k, t_k + dt]"
+    measured = f"of x(t_k - j_k), t_k = k dt, j_k {_seconds(lag.jitter)}" if lag.jitter[1] else "of x(t_k), t_k = k dt"
+    late = f"t_k + d_k, d_k {_seconds(lag.delay)}," if lag.delay[1] else "t_k"
+    first = " = ".join(name for name, side in (("d_0", lag.delay), ("j_0", lag.jitter)) if side[1])
+    return f"{measured}; in force from {late} on until the next one is; whatever each of them is, but {first} = 0"
+
+
+def _seconds(sides: tuple[float, float]) -> str:
+    return f"= {sides[0]!r} s" if sides[0] == sides[1] else f"in [{sides[0]!r}, {sides[1]!r}] s"
 
 
 def _method(document: Document) -> str:
@@ -163,7 +178,7 @@ def equation_lines(document: Document) -> list[str]:
     """The programs of a file as equations."""
     names, out = _names(document), list[str]()
     if document.ode is not None:
-        out += ["u_k, from x = x(t_k), held on [t_k, t_k + dt]:", *control_equations(document.programs[0], names)]
+        out += [f"u_k, {_held(document.ode.lag)}, of that state x:", *control_equations(document.programs[0], names)]
         out += ["x'(t), at all times:", *rate_equations(document.ode.rate, _disturbed_names(document))]
     out += [f"{label}: {text}" for one in document.requirements for label, text in _requirement(document, one)]
     for i, program in enumerate(document.programs if document.ode is None else ()):

@@ -68,9 +68,16 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
         first = states[0]
         if not ((tubes["start_lower"][r] <= first) & (first <= tubes["start_upper"][r])).all():
             raise Unproved("it does not start in X_I")
+        n = len(tubes["disturbance_lower"])
+        disturbances, late = disturbances[:, :n], disturbances[:, n:]
         inside = (tubes["disturbance_lower"] <= disturbances) & (disturbances <= tubes["disturbance_upper"])
         if not inside.all():
             raise Unproved("its disturbances are not in W")
+        lag = None if document.ode is None else document.ode.lag
+        if lag is not None and not all(
+            a <= s <= b for row in late for s, (a, b) in zip(row, (lag.delay, lag.jitter), strict=True)
+        ):
+            raise Unproved("its delays and jitters are not within their bounds")
         if not 0 <= step <= last:
             raise Unproved(f"its step {step} is none of the horizon {last}")
         if not (fraction == 0 or (0 < fraction < 1 and step < last and document.between != SAMPLES)):
@@ -80,7 +87,7 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
             x0, windows = _moved(first, sets[0]), document.windows(r)
             if document.ode is not None:
                 w = [_moved(row, sets[1]) for row in disturbances]
-                return _broken_by_solution(document, (x0, w, windows, step, fraction), safe)
+                return _broken_by_solution(document, (x0, w, windows, step, fraction), safe, late)
             w = [_moved(row, sets[1]) for row in disturbances[: step + (fraction > 0)]]
             x = replay(programs, x0, w, windows)
             now = on_line(x[step], x[step + 1], ball(fraction)) if fraction else x[step]
@@ -92,7 +99,8 @@ def prove_violation(document: Document, example: Mapping[str, Any], sets: tuple[
 
 
 def _broken_by_solution(
-    document: Document, given: tuple[Point, list[Point], np.ndarray, int, float], safe: SafeSet
+    document: Document, given: tuple[Point, list[Point], np.ndarray, int, float], safe: SafeSet,
+    late: np.ndarray,
 ) -> str:  # fmt: skip
     """Why a solution of the ODE breaks nothing for certain at a time, or nothing if it does.
 
@@ -100,6 +108,7 @@ def _broken_by_solution(
         document: the file.
         given: start, signal, windows, period and fraction of it, see :func:`~sagemp_cli.checker.solution.followed`.
         safe: what the loop must stay in.
+        late: of a control that lags, seconds of delay and jitter beside the signal.
     """
     assert document.ode is not None
     step, fraction = given[3:]
@@ -108,7 +117,7 @@ def _broken_by_solution(
     why = ""
     for parts in PARTS:
         try:
-            now = followed(document.ode, document.programs[0], *given, parts=parts)
+            now = followed(document.ode, document.programs[0], *given, parts=parts, late=late)
         except Unproved as e:
             why = str(e)
             continue
@@ -149,13 +158,14 @@ def applies(example: Mapping[str, Any], document: Document) -> bool:
     """Whether a record has the fields and shapes of a counterexample to one of the references."""
     tubes = document.tubes
     _, rows, n = tubes["tube_lower"].shape
+    late = document.ode is not None and document.ode.lag is not None
     states, w, reference = (example.get(key) for key in ("states", "disturbances", "reference"))
     return bool(
         isinstance(states, np.ndarray)
         and isinstance(w, np.ndarray)
         and states.shape == (rows, n)
         and w.ndim == 2
-        and w.shape[1] == len(tubes["disturbance_lower"])
+        and w.shape[1] == len(tubes["disturbance_lower"]) + (2 if late else 0)
         and (w.shape[0] == rows - 1 or document.ode is not None)
         and isinstance(reference, int | np.integer)
         and 0 <= reference < len(tubes["verdict"])

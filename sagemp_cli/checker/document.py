@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from sagemp_cli.checker.between import CONTINUOUS, MOST_PARTS, SAMPLES, SEGMENTS
+from sagemp_cli.checker.lag import Lag
 from sagemp_cli.checker.ode import Flow, flow_of
 from sagemp_cli.checker.program import Instruction, Program
 from sagemp_cli.checker.requirement import MOST_REQUIREMENTS, Required
@@ -107,7 +108,10 @@ class Document:
     def flow_of(self, c: int) -> dict[str, np.ndarray]:
         """The datasets between the samples of a cell, of its own parts."""
         parts = self.odes[self.cell_ode[c]].substeps
-        return {name: side[c][:, : parts - name.startswith("inner")] for name, side in self.flow.items()}
+        return {
+            name: side[c] if side.ndim < 4 else side[c][:, : parts - name.startswith("inner")]
+            for name, side in self.flow.items()
+        }
 
     @property
     def horizon(self) -> int:
@@ -178,8 +182,10 @@ def _read(file: Group, path: Path) -> Document:
     _, rows, n = tubes["tubes"]["tube_lower"].shape
     d = len(tubes["tubes"]["disturbance_lower"])
     loop = _loop(data.group("loop"), n, d, rows - 1)
-    odes, cell_ode = _odes(loop, loop.pop("rate"), tubes)
+    odes, cell_ode = _odes(loop, loop.pop("rate"), loop.pop("lag"), tubes)
     asked = _requirements(data.group("requirements"), n, rows - 1) if "requirements" in data else ()
+    if asked and odes and odes[0].lag is not None:
+        raise ArtifactError(f"{path}: /data/requirements are of loops whose control does not lag, this one's does")
     if asked and not odes:
         raise ArtifactError(f"{path}: /data/requirements are of loops in continuous time, this one is not")
     document = Document(
@@ -232,11 +238,11 @@ _SAID = ("experiment", "stage", "status", "version", "created_utc", "seconds")
 
 
 def _odes(
-    loop: Mapping[str, Any], rate: Program | None, tubes: Mapping[str, Any]
+    loop: Mapping[str, Any], rate: Program | None, lag: np.ndarray | None, tubes: Mapping[str, Any]
 ) -> tuple[tuple[Flow, ...], np.ndarray]:  # fmt: skip
     """The periods of a loop in continuous time, if it is one, and which a cell takes: then all of the file says so."""
     flow, continuous = tubes["flow"], tubes["between"] == CONTINUOUS
-    if not continuous and rate is None and not flow:
+    if not continuous and rate is None and not flow and lag is None:
         return (), np.zeros(0, np.int64)
     if not continuous or rate is None or not flow:
         raise ValueError(
@@ -249,8 +255,13 @@ def _odes(
     divisions, which = np.unique(np.stack([flow.pop("substeps"), flow.pop("order")], 1), axis=0, return_inverse=True)
     if not 1 <= len(divisions) <= _MOST_DIVISIONS:
         raise ValueError(f"its periods are divided in {len(divisions)} ways; 1 to {_MOST_DIVISIONS} can be checked")
+    late = None
+    if lag is not None:
+        if lag.shape != (2, 2) or lag.dtype != np.float64:
+            raise ValueError("/data/loop/lag must be two pairs of float64: of the delay, and of the jitter")
+        late = Lag.of(lag.tolist(), loop["dt"])
     made = [
-        flow_of(loop["programs"][0], rate, period=loop["dt"], substeps=substeps, order=order)
+        flow_of(loop["programs"][0], rate, period=loop["dt"], substeps=substeps, order=order, lag=late)
         for substeps, order in divisions.tolist()
     ]
     return tuple(made), which.reshape(-1)
@@ -284,7 +295,7 @@ def _plain(value: Any) -> Any:
 
 def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
     """What a group says of the loop, as fields of a :class:`Document`."""
-    _require_known(group, "programs", "step_program", "position", "rate", *_NAMES)
+    _require_known(group, "programs", "step_program", "position", "rate", "lag", *_NAMES)
     lookahead = int(group.attrs["lookahead"])
     if not 0 <= lookahead <= _MOST_LOOKAHEAD:
         raise ValueError(f"/data/loop: lookahead is {lookahead}")
@@ -318,6 +329,7 @@ def _loop(group: Group, n: int, d: int, steps: int) -> dict[str, Any]:
         "position": tuple(position.tolist()),
         "dt": float(group.attrs["dt"]) if "dt" in group.attrs else None,
         "rate": rate,
+        "lag": _dataset(group.dataset("lag")) if "lag" in group else None,
     }
 
 
@@ -421,7 +433,8 @@ _FLOW = ("lower", "upper", "remainder_lower", "remainder_upper", "curve", "drift
 
 def _flow(group: Group, tube: tuple[int, int, int]) -> dict[str, np.ndarray]:
     """What a group says of the time between the samples."""
-    _require_known(group, "substeps", "order", "inner_lower", "inner_upper", *_FLOW)
+    late = ("jump", "measured_lower", "measured_upper")
+    _require_known(group, "substeps", "order", "inner_lower", "inner_upper", *_FLOW, *late)
     cells, rows, n = tube
     substeps, order = (_dataset(group.dataset(name)) for name in ("substeps", "order"))
     for name, given in (("substeps", substeps), ("order", order)):
@@ -430,12 +443,16 @@ def _flow(group: Group, tube: tuple[int, int, int]) -> dict[str, np.ndarray]:
     most = int(substeps.max(initial=1))
     shapes = dict.fromkeys(_FLOW, (cells, rows - 1, most, n))
     shapes |= dict.fromkeys(("inner_lower", "inner_upper"), (cells, rows - 1, most - 1, n))
-    found = {name: _dataset(group.dataset(name)) for name in shapes}
+    shapes |= {"jump": (cells, rows - 1, most, n)} | dict.fromkeys(late[1:], (cells, rows - 1, n))
+    found = {
+        name: _dataset(group.dataset(name)) if name in group or name not in late else np.zeros(shapes[name])
+        for name in shapes
+    }
     for name, shape in shapes.items():
         if found[name].shape != shape or found[name].dtype != np.float64:
             raise ValueError(f"{group.name}/{name} must be float64 of shape {shape}")
         own = substeps - name.startswith("inner")
-        if (found[name] != 0).any(where=(np.arange(shape[2]) >= own[:, None])[:, None, :, None]):
+        if len(shape) == 4 and (found[name] != 0).any(where=(np.arange(shape[2]) >= own[:, None])[:, None, :, None]):
             raise ValueError(f"{group.name}/{name} says something of parts that a cell does not have")
     return found | {"substeps": substeps, "order": order}
 

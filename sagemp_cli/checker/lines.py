@@ -33,16 +33,16 @@ def lines_of(document: Document, c: int) -> list[Line]:
     ends = list(zip(boxes[:-1], boxes[1:], strict=True))
     if ode is None:
         return [Line(first, last) for first, last in ends]
-    lower, upper, curve, drift = (
+    lower, upper, curve, drift, jump = (
         [balls(row[place]) for row in flow[name].reshape(len(ends), -1)]
-        for name in ("lower", "upper", "curve", "drift")
+        for name in ("lower", "upper", "curve", "drift", "jump")
     )
     w = zip(*(balls(tubes[f"disturbance_{side}"][place]) for side in ("lower", "upper")), strict=True)
     swing = [ball(ode.length) * (b - a) for a, b in w]  # 2 h r_W
     return [
         Line(
             *pair,
-            bend=[bend + more for bend, more in zip(curve[i], swing, strict=True)],
+            bend=[b + s + ball(ode.length) * g for b, s, g in zip(curve[i], swing, jump[i], strict=True)],
             rest=[2 * e for e in drift[i]],
             stay=(lower[i], upper[i]),
         )

@@ -7,7 +7,9 @@ that. Where it becomes too wide, nothing is proved.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from fractions import Fraction
 
 import numpy as np
 
@@ -31,7 +33,7 @@ _ROUNDS = 20
 
 def followed(
     ode: Flow, control: Program, start: Point, signal: Sequence[Point], windows: np.ndarray, step: int, fraction: float,
-    parts: int,
+    parts: int, late: np.ndarray | None = None,
 ) -> Point:  # fmt: skip
     """A box around the state after some periods and a fraction of the next.
 
@@ -44,6 +46,8 @@ def followed(
         step: whole periods that pass, at most K.
         fraction: of the period after them, in [0, 1).
         parts: that a period is followed in at least, a power of two.
+        late: of a control that lags, seconds of its delay and of its measurement's jitter in the rows of the signal, of
+            which the first of every period counts; those of the first instant are left aside.
 
     Raises:
         Unproved: no box was found that the solution stays in, or it is too wide; or a signal that does not fit.
@@ -58,25 +62,33 @@ def followed(
         follower = _Follower(ode, parts)
     except ValueError as e:
         raise Unproved(str(e)) from None
-    x = list(start)
+    seconds = None if late is None or ode.lag is None else late[::pieces]
+    x, measured, held = list(start), list(start), None
     for k in range(step + (fraction > 0)):
-        numbers = []
+        numbers: Column = []
         if ode.controls:
-            inputs = {"state": x, "disturbance": signal[k * pieces], "numbers": balls(windows[k])}
+            inputs = {"state": measured, "disturbance": signal[k * pieces], "numbers": balls(windows[k])}
             numbers = [(u.lower(), u.upper()) for u in outputs_at(control, inputs)["control"]]
-        box = [(v.lower(), v.upper()) for v in x]
-        share = fraction if k == step else 1.0
-        passed = int(share * parts)  # exact: a multiple by a power of two
-        for i in range(passed):
-            w = signal[k * pieces + i * pieces // parts]
-            box = follower.after(box, numbers, points(w), follower.length)
-        if passed < share * parts:
-            w = signal[k * pieces + passed * pieces // parts]
-            box = follower.after(box, numbers, points(w), (ball(share) * parts - passed) * follower.length)
-        x = [low.union(high) for low, high in box]
+        box, own = [(v.lower(), v.upper()) for v in x], signal[k * pieces : (k + 1) * pieces]
+        now, end = Fraction(0), follower.period * (Fraction(fraction) if k == step else 1)
+        if seconds is not None:
+            if held is not None:  # the control before, until this one comes
+                now = min(Fraction(float(seconds[k, 0])), end)
+                box = follower.through(box, held, own, Fraction(0), now)
+            if k + 1 < min(len(windows), step + (fraction > 0)):  # what the next one is computed from
+                then = follower.period - Fraction(float(seconds[k + 1, 1]))
+                box, now = follower.through(box, numbers, own, now, then), then
+                measured = _union(box)
+        x = _union(follower.through(box, numbers, own, now, end))
+        measured = x if seconds is None else measured
+        held = numbers
         if not all(v.is_finite() for v in x):
             raise Unproved(f"its solution cannot be followed through period {k}: the box around it becomes too wide")
     return x
+
+
+def _union(box: Column) -> Point:
+    return [low.union(high) for low, high in box]
 
 
 class _Follower:
@@ -92,7 +104,21 @@ class _Follower:
         )  # fmt: skip
         self._n, self._rate = n, Bounds(ode.rate, ode.rate.next)
         self._coefficients = Bounds(made, made.control)
+        self.period, self._parts = Fraction(ode.period), parts
         self.length = ball(ode.length) * ode.substeps / parts
+
+    def through(self, box: Column, numbers: Column, signal: Sequence[Point], begin: Fraction, end: Fraction) -> Column:
+        """A box around the state at a time of a period, from one at an earlier time, in seconds."""
+        piece, length = self.period / len(signal), self.period / self._parts
+        while begin < end:
+            i = int(begin / piece)
+            stop = min(end, (i + 1) * piece)
+            count = math.ceil((stop - begin) / length)
+            time = (stop - begin) / count
+            for _ in range(count):
+                box = self.after(box, numbers, points(signal[i]), arb(time.numerator) / time.denominator)
+            begin = stop
+        return box
 
     def after(self, box: Column, numbers: Column, w: Column, time: arb) -> Column:
         """A box around the state some time later, at most a step."""

@@ -16,7 +16,9 @@ from annotated_types import Gt, doc
 from torch import Tensor, nn
 
 from sagemp_cli.dynamics.flatness import Array
+from sagemp_cli.dynamics.lag import Lag, Seconds
 from sagemp_cli.errors import ConfigError
+from sagemp_cli.sets.box import Box
 
 DISTURBANCE_READINGS = ("derivative", "state")
 
@@ -35,7 +37,7 @@ class Dynamics(nn.Module):
 
     With ``time="continuous"`` the robot is the ODE ``x' = f(x, u) + w`` itself, u is held between the instants
     ``k dt``, and a step is a simulated solution over one period with w held too. What is proved speaks of all times and
-    of every measurable w (``docs/continuous_time.md``).
+    of every measurable w (``docs/continuous_time.md``). There the control may lag (:class:`~.dynamics.lag.Lag`).
     """
 
     state_names: tuple[str, ...]
@@ -63,6 +65,8 @@ class Dynamics(nn.Module):
         state_upper: list[float],
         disturbance: Literal["derivative", "state"] = "derivative",
         time: Literal["discrete", "continuous"] = "discrete",
+        delay: Seconds = 0.0,
+        jitter: Seconds = 0.0,
     ) -> None:
         super().__init__()
         name = type(self).__name__
@@ -76,6 +80,9 @@ class Dynamics(nn.Module):
             raise ConfigError(
                 f"{name}: with time=continuous w is added to the derivative, found disturbance '{disturbance}'"
             )
+        self.lag = Lag.of(name, delay, jitter, float(dt))
+        if self.lag and time != "continuous":
+            raise ConfigError(f"{name}: delay and jitter are those of time=continuous; in discrete time there are none")
         self.dt = float(dt)
         self.time: Literal["discrete", "continuous"] = time
         self.disturbance: Literal["derivative", "state"] = disturbance
@@ -126,6 +133,19 @@ class Dynamics(nn.Module):
         """Whether the robot is an ODE, not a map from instant to instant."""
         return self.time == "continuous"
 
+    def unknowns(self, disturbance: Box) -> Box:
+        """What is unknown of every step: w in a box ``(n,)``; if a control lags, the seconds of delay and jitter."""
+        if not self.lag:
+            return disturbance
+        sides = zip((disturbance.lower, disturbance.upper), (self.lag.box.lower, self.lag.box.upper), strict=True)
+        return Box(*(torch.cat(pair) for pair in sides))
+
+    def completed(self, w: Tensor) -> Tensor:
+        """Disturbances ``(..., K, d)`` of a rollout; where they say nothing of a lag, it is the least that may be."""
+        if not self.lag or w.shape[-1] != self.state_dim:
+            return w
+        return torch.cat([w, self.lag.box.lower.expand(*w.shape[:-1], 2)], dim=-1)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """One forward-Euler step under the disturbance ``w (..., n)``; in continuous time a simulated solution over one
         period. See the class for how w enters.
@@ -140,25 +160,49 @@ class Dynamics(nn.Module):
         In discrete time the rollout itself: between the instants are straight lines.
 
         Args:
-            states, controls, w: of the rollout, ``(..., K+1, n)``, ``(..., K, m)`` and ``(..., K, n)``.
+            states, controls, w: of the rollout, ``(..., K+1, n)``, ``(..., K, m)`` and ``(..., K, d)``, see
+                :meth:`unknowns`.
         """
         if not self.continuous:
             return states
-        inner = self._simulated(states[..., :-1, :], controls, w)[:-1]
+        w = self.completed(w)
+        held = torch.cat([controls[..., :1, :], controls[..., :-1, :]], dim=-2)
+        inner = self._simulated(states[..., :-1, :], controls, w, held)[:-1]
         inside = torch.stack([states[..., :-1, :], *inner], dim=-2).flatten(-3, -2)
         return torch.cat([inside, states[..., -1:, :]], dim=-2)
 
-    def _simulated(self, x: Tensor, u: Tensor, w: Tensor) -> list[Tensor]:
+    def lagged(self, x: Tensor, held: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """The state a period later, simulated, of which ``held`` was in force until the control came; ``w (..., d)``,
+        see :meth:`unknowns`.
+        """
+        return self._simulated(x, u, w, held)[-1]
+
+    def measured(self, x: Tensor, held: Tensor, w: Tensor) -> Tensor:
+        """The state, simulated, that was measured before ``x``, under the control that was in force; ``w (..., d)``."""
+        if w.shape[-1] == self.state_dim:
+            return x
+        return self._solved(x, held, w[..., : self.state_dim], -w[..., self.state_dim + 1 :])
+
+    def _simulated(self, x: Tensor, u: Tensor, w: Tensor, held: Tensor | None = None) -> list[Tensor]:
         """States at the ends of the parts of a period."""
-        h, found = self.dt / SIMULATED, []
-        for _ in range(SIMULATED):
-            a = self.derivative(x, u) + w
-            b = self.derivative(x + h / 2 * a, u) + w
-            c = self.derivative(x + h / 2 * b, u) + w
-            d = self.derivative(x + h * c, u) + w
-            x = x + h / 6 * (a + 2 * b + 2 * c + d)
+        h, n, found = self.dt / SIMULATED, self.state_dim, []
+        rates = w[..., :n]
+        for i in range(SIMULATED):
+            if w.shape[-1] == n or held is None:
+                x = self._solved(x, u, rates, h)
+            else:
+                before = (w[..., n : n + 1] - i * h).clamp(0.0, h)
+                x = self._solved(self._solved(x, held, rates, before), u, rates, h - before)
             found.append(x)
         return found
+
+    def _solved(self, x: Tensor, u: Tensor, w: Tensor, h: Tensor | float) -> Tensor:
+        """The state some seconds later, by one step of the classical Runge-Kutta method."""
+        a = self.derivative(x, u) + w
+        b = self.derivative(x + h / 2 * a, u) + w
+        c = self.derivative(x + h / 2 * b, u) + w
+        d = self.derivative(x + h * c, u) + w
+        return x + h / 6 * (a + 2 * b + 2 * c + d)
 
     def advance(self, x: Tensor, derivative: Tensor, w: Tensor) -> Tensor:
         """The same from a derivative that is known already."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from sagemp_cli.config.ranges import Widths
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.lag import Seconds
 from sagemp_cli.errors import ConfigError, did_you_mean
 
 NEGATIVE_SLOPE = 0.1
@@ -41,7 +42,7 @@ class Learned(Dynamics):
         inputs: names of the states that the network reads, all by default; it reads all controls. The columns of the
             first layer that belong to other states are zero: a robot that moves alike wherever it is need not be told
             where that is, and a wide set of positions then costs the proof nothing.
-        time: see :class:`~sagemp_cli.dynamics.base.Dynamics`; that of the model by default.
+        time, delay, jitter: see :class:`~sagemp_cli.dynamics.base.Dynamics`; those of the model by default.
     """
 
     def __init__(
@@ -52,6 +53,8 @@ class Learned(Dynamics):
         activation: Literal["leaky_relu", "silu", "softplus", "tanh"] = "silu",
         inputs: list[str] | None = None,
         time: Literal["discrete", "continuous"] | None = None,
+        delay: Seconds | None = None,
+        jitter: Seconds | None = None,
     ) -> None:
         robot = model
         if isinstance(robot, Learned):
@@ -75,6 +78,8 @@ class Learned(Dynamics):
             state_upper=robot.state_upper.tolist(),
             disturbance=robot.disturbance,
             time=robot.time if time is None else time,
+            delay=list(robot.lag.delay) if delay is None else delay,
+            jitter=list(robot.lag.jitter) if jitter is None else jitter,
         )
         self.model = robot
         self.activation = activation

@@ -33,12 +33,15 @@ class OpenLoop:
         return self.dynamics.state_dim
 
     def rollout(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """States ``(..., K+1, n)`` and the controls ``(..., K, m)``, from starts ``(..., n)`` under ``w (..., K, n)``.
+        """States ``(..., K+1, n)`` and the controls ``(..., K, m)``, from starts ``(..., n)`` under ``w (..., K, d)``.
 
-        Fewer rows of ``w`` give a shorter rollout.
+        Fewer rows of ``w`` give a shorter rollout. Where a control would lag it comes late here too.
         """
+        w, dynamics = self.dynamics.completed(w), self.dynamics
         steps, states = w.shape[-2], [x]
         controls = self.controls[..., :steps, :].expand(*x.shape[:-1], steps, -1)
         for k in range(steps):
-            states.append(self.dynamics.step(states[-1], controls[..., k, :], w[..., k, :]))
+            held, u, now = controls[..., max(k - 1, 0), :], controls[..., k, :], w[..., k, :]
+            after = dynamics.lagged(states[-1], held, u, now) if dynamics.lag else dynamics.step(states[-1], u, now)
+            states.append(after)
         return torch.stack(states, dim=-2), controls

@@ -32,7 +32,7 @@ class Execution:
         chosen: index of the certified reference that is tracked instead, ``(Q,)``.
         error: E_tau of equation 10, ``(Q,)``.
         query: query of each rollout, ``(rollouts,)``.
-        states, controls, disturbances: ``(rollouts, K+1, n)``, ``(rollouts, K, m)``, ``(rollouts, K, n)``.
+        states, controls, disturbances: ``(rollouts, K+1, n)``, ``(rollouts, K, m)``, ``(rollouts, K, d)``.
         in_tube: whether the rollout stayed in its certified tube, ``(rollouts,)``.
         safe: whether it kept clear over the whole of every step and ended in the goal, ``(rollouts,)``.
     """
@@ -92,15 +92,16 @@ def execute_queries(
     index, error = closest_reference(sampled.numpy(), library.references.numpy(), eligible=eligible.numpy())
     chosen = torch.from_numpy(index)
 
+    unknowns = problem.dynamics.unknowns(library.disturbance)
     horizon, calm = library.references.shape[1] - 1, (rollouts + 1) // 2
     parts: list[tuple[Tensor, ...]] = []
     with (progress or Silent()).task("executing", len(starts)) as task:
         for q, i in enumerate(chosen.tolist()):
             loop = ClosedLoop(problem.dynamics, tracker, library.references[i])
             x = starts[q].expand(rollouts, -1)
-            w = random_disturbances(library.disturbance, calm, horizon=horizon, generator=generator)
+            w = random_disturbances(unknowns, calm, horizon=horizon, generator=generator)
             if rollouts > calm:
-                harm = worst_case_disturbances(loop, x[calm:], disturbance=library.disturbance, generator=generator)
+                harm = worst_case_disturbances(loop, x[calm:], disturbance=unknowns, generator=generator)
                 w = torch.cat([w, harm])
             with torch.no_grad():
                 states, controls = loop.rollout(x, w)

@@ -94,7 +94,7 @@ def try_references(
     """
     if rollouts < 1:
         raise UsageError(f"rollouts must be positive, found {rollouts}")
-    dynamics, disturbance = problem.dynamics, problem.disturbance
+    dynamics, disturbance = problem.dynamics, problem.unknowns
     inverse = invert(dynamics.analytical, references, within_limits=within_limits)
     ways: tuple[Callable[[Tensor], Loop], ...] = (
         lambda r: OpenLoop(dynamics, inverse.controls[r]),

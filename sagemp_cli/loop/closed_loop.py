@@ -15,6 +15,7 @@ from torch import Tensor
 from sagemp_cli.dynamics.base import Dynamics
 from sagemp_cli.errors import NonFiniteError, UsageError
 from sagemp_cli.loop.controller import Controller
+from sagemp_cli.sets.box import Box
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,11 @@ class ClosedLoop:
         """Whether the robot is an ODE whose control is held between the instants."""
         return self.dynamics.continuous
 
+    @property
+    def lag(self) -> Box | None:
+        """Bounds of the control's delay and its measurement's jitter, in seconds, ``(2,)``; None if there is none."""
+        return self.dynamics.lag.box if self.dynamics.lag else None
+
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed derivative of the state, ``f(x, u)``."""
         return self.dynamics.derivative(x, u)
@@ -106,10 +112,22 @@ class ClosedLoop:
 
         Args:
             x: starts ``(..., n)``.
-            w: disturbances ``(..., K, n)``; fewer rows give a shorter rollout.
+            w: disturbances ``(..., K, n)``; fewer rows give a shorter rollout. Of a control that lags with two columns
+                more, see :meth:`~sagemp_cli.dynamics.base.Dynamics.unknowns`; without them it lags as little as it may.
         """
-        states, controls = [x], []
+        states, controls, dynamics = [x], [], self.dynamics
+        lags, w = bool(dynamics.lag), dynamics.completed(w)
         for k in range(w.shape[-2]):
-            controls.append(self.control(k, states[-1]))
-            states.append(self.after(states[-1], controls[-1], w[..., k, :]))
+            now = w[..., k, :]
+            if not lags:
+                controls.append(self.control(k, states[-1]))
+                states.append(self.after(states[-1], controls[-1], now))
+                continue
+            measured = states[-1]
+            if k:
+                before = torch.cat([w[..., k - 1, :-2], now[..., -2:]], dim=-1)
+                measured = dynamics.measured(states[-1], controls[-1], before)
+            controls.append(self.control(k, measured))
+            held = controls[max(k - 1, 0)]  # the first control is there at once
+            states.append(dynamics.lagged(states[-1], held, controls[-1], now))
         return torch.stack(states, dim=-2), torch.stack(controls, dim=-2)

@@ -15,11 +15,13 @@ from sagemp_cli.checker.check import Report, sides
 from sagemp_cli.checker.claim import disturbance_names
 from sagemp_cli.checker.clearance import clearances, goal_margins
 from sagemp_cli.checker.document import Document
+from sagemp_cli.checker.lag import Lag as Proved
 from sagemp_cli.checker.lines import lines_of
 from sagemp_cli.checker.points import outputs_at
 from sagemp_cli.checker.program import Program
 from sagemp_cli.checker.scene import SafeSet, SetOfConfig
 from sagemp_cli.dynamics.base import Dynamics
+from sagemp_cli.dynamics.lag import Lag
 from sagemp_cli.dynamics.learned import Learned
 from sagemp_cli.pipeline.problem import robot_of
 
@@ -151,6 +153,7 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
         yield Difference("step", "the network in the file", "a network learned from the formulas", covers=True)
         return
     if document.ode is not None:
+        yield from _lag(document.ode.lag, robot.lag)
         yield from _rate(document, document.ode.rate, model)
         return
     program = (document if true is None else true).programs[0]
@@ -177,6 +180,15 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
             worst = max(worst, _apart(after, exact))
     if not worst <= _TOLERANCE:
         yield _another("step", worst)
+
+
+def _lag(proved: Proved | None, asked: Lag) -> Iterator[Difference]:
+    """How late a control may be, beside how late it is said to be."""
+    for name in ("delay", "jitter"):
+        one, other = (0.0, 0.0) if proved is None else getattr(proved, name), getattr(asked, name)
+        if one != other:
+            words = [" to ".join(f"{v:.6g}" for v in sides) + " s" for sides in (one, other)]
+            yield Difference(name, *words, covers=one[0] <= other[0] and other[1] <= one[1])
 
 
 def _rate(document: Document, rate: Program, model: Dynamics) -> Iterator[Difference]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from sagemp_cli.errors import UsageError
 from sagemp_cli.loop.controller import Controller
@@ -83,6 +84,7 @@ def continuous_loop_record(
         control_units=_words(control_units, [""] * m, "units of controls"),
         position=np.array(list(position), np.int64),
         dt=loop.period,
+        lag=None if loop.lag is None else torch.stack([loop.lag.lower, loop.lag.upper], -1).numpy(),
         rate=to_record(loop.rate),
     )
 

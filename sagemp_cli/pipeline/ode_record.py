@@ -104,7 +104,7 @@ def _unknown(cells: Box, periods: int) -> tuple[Tube, list[Flow]]:
         rest = torch.full((count, periods, n), sign * torch.inf, dtype=torch.float64)
         sides.append(torch.cat([side[:, None], rest], 1))
     nothing = torch.zeros(count, periods, 1, n, dtype=torch.float64)
-    flow = Flow(Division(1, 1), *(nothing,) * 8).known_until(torch.zeros(count, dtype=torch.int64))
+    flow = Flow(Division(1, 1), *(nothing,) * 11).known_until(torch.zeros(count, dtype=torch.int64))
     return Tube(*sides), [flow]
 
 

@@ -284,6 +284,7 @@ def stages_of(config: Mapping[str, Any], last: Sequence[str] | None = None) -> l
 _LATER: Mapping[str, Any] = {
     "dynamics.time": "discrete",
     "dynamics.model.time": "discrete",
+    **{f"dynamics.{model}{key}": 0.0 for model in ("", "model.") for key in ("delay", "jitter")},
     "proof.substeps": "auto",
     "proof.order": "auto",
 }

@@ -62,9 +62,15 @@ def flows_of(record: FlowBounds, tube: Tube) -> list[tuple[np.ndarray, Flow]]:
             torch.cat([side[own][:, :-1, None], torch.from_numpy(inner[own][:, :, : substeps - 1])], 2)
             for side, inner in ((tube.lower, record.inner_lower), (tube.upper, record.inner_upper))
         ]
+        jump = np.zeros_like(record.lower) if record.jump is None else record.jump
         sides = (record.lower, record.upper, record.remainder_lower, record.remainder_upper, record.curve, record.drift)
-        parts = [torch.from_numpy(side[own][:, :, :substeps]) for side in sides]
-        found.append((own, Flow(Division(substeps, order), *ends, *parts)))
+        parts = [torch.from_numpy(side[own][:, :, :substeps]) for side in (*sides, jump)]
+        none = np.zeros_like(record.lower[:, :, 0])
+        measured = [
+            torch.from_numpy((none if side is None else side)[own][:, :, None])
+            for side in (record.measured_lower, record.measured_upper)
+        ]
+        found.append((own, Flow(Division(substeps, order), *ends, *parts, *measured)))
     return found
 
 
@@ -88,7 +94,18 @@ def flow_record(flows: Sequence[Flow]) -> FlowBounds:
             side: every(side)
             for side in ("lower", "upper", "remainder_lower", "remainder_upper", "curve", "drift")
         },
+        jump=every("jump") if any(bool((flow.jump != 0).any()) for flow in flows) else None,
+        **_measured(flows),
     )  # fmt: skip
+
+
+def _measured(flows: Sequence[Flow]) -> dict[str, np.ndarray]:
+    """What is left out of measured states, where there is anything."""
+    found = {name: torch.cat([getattr(flow, name)[:, :, 0] for flow in flows]) for name in _MEASURED}
+    return {name: side.numpy() for name, side in found.items()} if any(bool(s.any()) for s in found.values()) else {}
+
+
+_MEASURED = ("measured_lower", "measured_upper")
 
 
 def relaxations_record(recording: Recording) -> Relaxations:

@@ -52,6 +52,9 @@ class Flow:
         remainder_lower, remainder_upper: what the Taylor polynomial leaves out lies here.
         curve: bound of ``h^2 / 2 |z''|`` of the solutions z under a constant disturbance, h the length of a part.
         drift: how far a solution is from that under a mean of its disturbance, but for the integrals of both.
+        jump: of a control that lags, how much the rate changes with it at the beginning of every part; else 0.
+        measured_lower, measured_upper: of a control that lags, what is left out of the state that was measured, S is 1;
+            else 0.
     """
 
     division: Division
@@ -63,6 +66,9 @@ class Flow:
     remainder_upper: Tensor
     curve: Tensor
     drift: Tensor
+    jump: Tensor
+    measured_lower: Tensor
+    measured_upper: Tensor
 
     def select(self, index: Tensor) -> Flow:
         """The same for some of the cells, in the given order."""
@@ -71,9 +77,9 @@ class Flow:
     def known_until(self, period: Tensor) -> Flow:
         """The same, with nothing known from some period ``(C,)`` of each cell on."""
         lost = (torch.arange(self.lower.shape[1]) >= period[:, None])[..., None, None]
-        signs = (-1, 1, -1, 1, -1, 1, 1, 1)
-        sides = zip(signs, self._sides(), strict=True)
-        return Flow(self.division, *(torch.where(lost, sign * torch.inf, side) for sign, side in sides))
+        signs, sides = (-1, 1, -1, 1, -1, 1, 1, 1), self._sides()
+        bounds = (torch.where(lost, sign * torch.inf, side) for sign, side in zip(signs, sides, strict=False))
+        return Flow(self.division, *bounds, *sides[len(signs) :])  # what is known of a lag says nothing by itself
 
     def lines(self, tube: Tube, w: Box, period: float) -> tuple[Tube, Bulge]:
         """Boxes at the ends of all parts, ``(C, K S + 1, n)``, and how far solutions leave the straight lines between.
@@ -88,9 +94,11 @@ class Flow:
             for side, of_tube in zip((self.state_lower, self.state_upper), (tube.lower, tube.upper), strict=True)
         ]
         parts = self.division.substeps
-        swing = round_up(2 * period / parts * w.radius).expand(self.lower.shape[1], -1)
+        swing = round_up(2 * period / parts * w.radius).expand(self.lower.shape[1], -1).repeat_interleave(parts, 0)
+        if bool((self.jump > 0).any()):
+            swing = round_up(swing + round_up(period / parts * self.jump.flatten(1, 2)))
         rest = round_up(2 * self.drift.flatten(1, 2))
-        return Tube(*ends), Bulge(self.curve.flatten(1, 2), swing.repeat_interleave(parts, 0), rest)
+        return Tube(*ends), Bulge(self.curve.flatten(1, 2), swing, rest)
 
     def arrays(self) -> dict[str, Tensor]:
         """All of it by name."""

@@ -119,6 +119,12 @@ class LoopRecord:
         units="s",
         optional=True,
     )
+    lag: np.ndarray | None = array(
+        "lags sides",
+        "in continuous time: least and most of the control's delay and of its measurement's jitter",
+        units="s",
+        optional=True,
+    )
     rate: ProgramRecord | None = group(
         ProgramRecord,
         "in continuous time x' - w, of the state and, as numbers, the control, which 'programs' is then",
@@ -173,6 +179,20 @@ class FlowBounds:
     drift: np.ndarray = array(
         "cells K S n", "how far a solution is from that under a mean of w, beside the integrals of both", finite=False
     )
+    jump: np.ndarray | None = array(
+        "cells K S n",
+        "of a control that lags, bounds of how much it changes the rate at the beginning of a part",
+        finite=False,
+        optional=True,
+    )
+    measured_lower: np.ndarray | None = array(
+        "cells K n", "of a control that lags, lower bounds of what is left out of the state that was measured",
+        finite=False, optional=True,
+    )  # fmt: skip
+    measured_upper: np.ndarray | None = array(
+        "cells K n", "of a control that lags, upper bounds of what is left out of the state that was measured",
+        finite=False, optional=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +264,9 @@ class Counterexample:
     depth: float = scalar("depth of the violation (> 0)")
     states: np.ndarray = array("K+1 n", "replayed states")
     disturbances: np.ndarray = array(
-        "signal d", "disturbances of all steps, in continuous time of equally many equal pieces of each period"
+        "signal unknowns",
+        "disturbances of all steps, in continuous time of equally many equal pieces of each period; of a control that "
+        "lags also the seconds of its delay and its measurement's jitter",
     )
 
 
@@ -312,7 +334,10 @@ class Rollouts:
     query: np.ndarray = array("rollouts", "query that each rollout belongs to", dtype="int64")
     states: np.ndarray = array("rollouts K+1 n", "executed states")
     controls: np.ndarray = array("rollouts K m", "executed controls")
-    disturbances: np.ndarray = array("rollouts K n", "disturbances")
+    disturbances: np.ndarray = array(
+        "rollouts K unknowns",
+        "disturbances; of a control that lags also the seconds of its delay and its measurement's jitter",
+    )
     in_tube: np.ndarray = array("rollouts", "whether the whole rollout stayed in its tube", dtype="bool")
     safe: np.ndarray = array(
         "rollouts", "whether it stayed in the safe set over the whole of every step and reached the goal", dtype="bool"

@@ -55,6 +55,10 @@ class LoopClaim:
     state_names: tuple[str, ...]
     between: Between = Between.SEGMENTS
 
+    def unknowns(self, disturbance: Box) -> Box:
+        """What is unknown of every step: w alone."""
+        return disturbance
+
     @property
     def bounds_the_position(self) -> bool:
         """Whether there is a workspace."""

@@ -312,7 +312,7 @@ def _breaks(prover: CellProver, references: Tensor, cells: Box) -> Tensor:
     x = torch.stack([cells.center, *_vertices(cells)])
     problem = prover.problem
     loop = prover.loop(references)
-    w = problem.disturbance.center.expand(*x.shape[:-1], loop.horizon, -1)
+    w = problem.unknowns.center.expand(*x.shape[:-1], loop.horizon, -1)
     with torch.no_grad():
         states, controls = loop.rollout(x, w)
         path = problem.dynamics.path(states, controls, w)

@@ -109,13 +109,15 @@ def make_case(
     limit=None,
     time="discrete",
     order=None,
+    lag=None,
     **changes,
 ) -> Case:
     """References are straight; ``side`` shifts a second one sideways, 0 makes one only; ``disc`` moves the disc;
-    ``limit`` is where the controls saturate; ``order`` is that of polynomials in continuous time.
+    ``limit`` is where the controls saturate; ``order`` is that of polynomials in continuous time,
+    ``lag`` the delay and the jitter there.
     """
     config = config_of(robot, **changes)
-    config["dynamics"]["time"] = time
+    config["dynamics"] |= {"time": time, **(lag or {})}
     if disc is not None:
         config["scene"]["obstacles"][0]["center"] = disc
     problem = problem_from(config)

@@ -24,8 +24,8 @@ class Vehicle:
 
     state_dim, period = 3, 0.2
 
-    def __init__(self, horizon: int, speed: float = 1.0) -> None:
-        self.horizon, self.speed = horizon, speed
+    def __init__(self, horizon: int, speed: float = 1.0, lag: Box | None = None) -> None:
+        self.horizon, self.speed, self.lag = horizon, speed, lag
 
     def numbers(self):
         return torch.zeros(self.horizon, 0, dtype=torch.float64)
@@ -78,9 +78,11 @@ class FlowCase:
         return write_artifact(path, made, header, overwrite=True)
 
 
-def flow_case(path: Path, *, horizon: int = 4, substeps: int = 2, order: int = 2) -> FlowCase:
+def flow_case(
+    path: Path, *, horizon: int = 4, substeps: int = 2, order: int = 2, lag: Box | None = None
+) -> FlowCase:  # fmt: skip
     """Two cells of a few periods; its figures are those that the checker finds, at ``path``."""
-    loop, config = Vehicle(horizon), config_of(horizon)
+    loop, config = Vehicle(horizon, lag=lag), config_of(horizon)
     start, w = _box(config["start"]), _box(config["disturbance"])
     middle = start.center[1:2]
     cells = Box(

@@ -23,6 +23,7 @@ RATE = program(
     line("constant", constants=[A]), line("mul", 0, 3), line("constant", constants=[B]), line("mul", 2, 5),
     line("add", 4, 6), n=1, d=1, g=1, next=7,
 )  # fmt: skip
+NO_LAG = {"jump": np.zeros((1, 1, 1)), "measured_lower": np.zeros((1, 1)), "measured_upper": np.zeros((1, 1))}
 
 
 def image(state):
@@ -56,7 +57,7 @@ def prove(order=2, substeps=2, **claims):
     given = {"lower": 0.5, "upper": 1.3, "remainder_lower": wide[0], "remainder_upper": wide[1],
              "curve": curve * more, "drift": drift * more} | claims  # fmt: skip
     sides = {name: np.full((1, 1, 1), value) for name, value in given.items()}
-    claim = FlowClaim(np.zeros((1, 0, 1)), np.zeros((1, 0, 1)), **sides)
+    claim = FlowClaim(np.zeros((1, 0, 1)), np.zeros((1, 0, 1)), **sides, **NO_LAG)
     with ctx.workprec(BITS):
         begin, control = (list(zip(balls(v[:1]), balls(v[1:]), strict=True)) for v in (X0, U))
         PartProver(flow, W[:1], W[1:]).prove(claim, (0, 0), begin, control)
@@ -123,7 +124,7 @@ def test_the_width_of_the_slopes_counts_at_the_end_of_a_part():
         np.zeros((1, 0, 1)), np.zeros((1, 0, 1)),
         *(np.full((1, 1, 1), v) for v in (
             0.4, 0.9, need[0] - 1e-10, need[1] + 1e-10, h * h * abs(second).max() * (1 + 1e-9), drift * (1 + 1e-9),
-        )),
+        )), **NO_LAG,
     )  # fmt: skip
     with ctx.workprec(BITS):
         prover, begin = PartProver(flow, w[:1], w[1:]), list(zip(balls(x[:1]), balls(x[1:]), strict=True))
@@ -145,5 +146,5 @@ def test_a_drift_below_zero_proves_nothing():
             given = {"lower": -9.0, "upper": 9.0, "remainder_lower": 0.0, "remainder_upper": 0.0, "curve": 99.0}
             sides = {name: np.full((1, 1, 1), value) for name, value in (given | {"drift": drift}).items()}
             with pytest.raises(Unproved, match="drift|must be finite"):
-                claim = FlowClaim(np.zeros((1, 0, 1)), np.zeros((1, 0, 1)), **sides)
+                claim = FlowClaim(np.zeros((1, 0, 1)), np.zeros((1, 0, 1)), **sides, **NO_LAG)
                 prover.prove(claim, (0, 0), begin, control)

@@ -153,3 +153,13 @@ def test_a_rollout_is_a_solution_and_its_path_goes_through_it():
     torch.testing.assert_close(states[1], x, rtol=0, atol=1e-4)
     discrete = dataclasses.replace(asked, dynamics=Unicycle(dt=0.1, **LIMITS))
     assert discrete.dynamics.path(states, controls, w) is states
+
+
+def test_a_control_that_lags_is_proved_with_cells_that_are_cut_where_it_pays():
+    asked = problem(Block((0.0, 0.3), (0.8, 0.4), "beside"), delay=0.03, jitter=0.01)
+    prover = CellProver(Affine(), asked, tracker())
+    found = verify_references(prover, reference()[None], counts=None, budget=4)
+    assert found.verdicts[0].outcome is Outcome.SAFE
+    near = problem(Block((0.0, 0.0162), (0.8, 0.4), "beside"), delay=0.03, jitter=0.01)
+    found = verify_references(CellProver(Affine(), near, tracker()), reference()[None], counts=None, budget=4)
+    assert len(found.cells.lower) > 1

@@ -74,7 +74,7 @@ def suggested(
     propagator: Propagator, loop: SampledLoop, cells: Box, w: Box, *, substeps: int | None, order: int | None
 ) -> Division:
     """A division to begin with, by trials on the first periods of cells ``(C, n)``; what is given stays."""
-    first = loop.part(0, min(TRIED, loop.horizon))
+    first = loop.beginning(min(TRIED, loop.horizon))
     division: Division | None = Division(substeps or 1, order or ORDERS[0])
     best, least, lost = division, torch.inf, math.inf
     while division is not None:

@@ -9,6 +9,8 @@ controls in U and ``r_W`` the radius of W:
 - With ``D`` the width of the bounds of Df, at the end of the part it is at most ``g = D 3/4 h^2 r_W + h A e``.
 - The remainder lies in ``h^{p+1} c_{p+1}(X, U, W) + [-g, g]``.
 
+Where a control before may be in force at first, both e and g are larger by what that moves (:class:`Held`).
+
 Everything is for all parts of all periods and cells at once, and rounded outwards.
 """
 
@@ -34,6 +36,27 @@ _GROWTH = 0.1
 
 
 @dataclass(frozen=True)
+class Held:
+    """Of N parts, what is known of the control that was before; where it is not in force, all of it is 0.
+
+    Attributes:
+        control: p and u in one box, ``(N, m)``; u alone where p is not in force.
+        less: p - u, ``(N, m)``.
+        jump: bound of ``|f(x, p) - f(x, u)|`` where the part begins, ``(N, n)``.
+        most: bound of the share of the part that p is in force for, ``(N, 1)``.
+        weight: the most that the jump may have in a mean of what moves the state, ``(N, 1)``.
+        swing: see :attr:`~sagemp_cli.reachability.continuous.lagging.Shares.swing`, ``(N, 1)``.
+    """
+
+    control: IntervalForm
+    less: IntervalForm
+    jump: Tensor
+    most: Tensor
+    weight: Tensor
+    swing: Tensor
+
+
+@dataclass(frozen=True)
 class Enclosure:
     """Of N parts; infinite where nothing was found.
 
@@ -53,21 +76,55 @@ class Enclosure:
 
 
 @torch.no_grad()
-def enclosure(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> Enclosure:
+def enclosure(
+    programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box, held: Held | None = None
+) -> Enclosure:
     """Of N parts that begin in these states ``(N, n)`` under these controls ``(N, m)``; w is ``(n,)`` or ``(N, n)``."""
-    stay = _a_priori(programs, state, control, w)
-    inside = _flowed(programs, state, stay, control, w)  # as an image it is no larger than what it was found in
+    signal = w
+    if held is not None:  # what moves the solutions of constant disturbances
+        reach = round_up(held.weight * held.jump)
+        signal = Box(round_down(w.lower - reach), round_up(w.upper + reach))
+    flowed = _Flowed(programs, state, control, w, signal, held)
+    stay = _a_priori(state, flowed)
+    inside = flowed(stay)  # as an image it is no larger than what it was found in
     n, h, p = state.lower.shape[-1], programs.length, programs.division.order
-    given = IntervalForm(w.lower, w.upper)
+    given = IntervalForm(signal.lower, signal.upper)
     found = _watched(programs.coefficients, inside, given, control)
     second, last = (IntervalForm(found.lower[:, i : i + n], found.upper[:, i : i + n]) for i in (0, (p > 1) * n))
     slopes = _slopes(programs, inside, control)
-    drift = _drift(slopes, w.radius, h)
-    end = _drift_at_the_end(slopes, w.radius, h, drift)
+    swung, pushed = _swung(w.radius, h), torch.zeros(n, dtype=torch.float64)
+    if held is not None:
+        swung = swung + (h * h * _MORE) * held.swing * held.jump
+        pushed = _pushed(programs, inside, held, w)
+    drift = _drift(slopes, swung, pushed, h)
+    end = _drift_at_the_end(slopes, swung, pushed, h, drift)
     power = round_up(torch.tensor(h**p, dtype=torch.float64) * h * (1 + 1e-12)), h**p * h * (1 - 1e-12)
     low, high = _times(last, power[1], float(power[0]))
     curve = round_up(torch.maximum(second.lower.abs(), second.upper.abs()) * (h * h * (1 + 1e-12)))
     return Enclosure(stay.lower, stay.upper, round_down(low - end), round_up(high + end), _number(curve), drift)
+
+
+@torch.no_grad()
+def measured_rest(
+    programs: Expansion, stay: IntervalForm, control: IntervalForm, w: Box, jitter: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """``[j^2] c_2(X, P, W)``: what ``x - j (f(x, p) + v)`` leaves of the state j seconds before x, of N measurements.
+
+    Args:
+        programs: of the loop.
+        stay: boxes around all that is passed since, ``(N, n)``.
+        control: that was in force, ``(N, m)``.
+        w: ``(n,)`` or ``(N, n)``.
+        jitter: bounds of j, ``(N, 1)``.
+    """
+    n = stay.lower.shape[-1]
+    found = _watched(programs.coefficients, stay, IntervalForm(w.lower, w.upper), control)
+    least, most = ((j * j) * scale for j, scale in zip(jitter, (1 - 1e-12, 1 + 1e-12), strict=True))
+    second = IntervalForm(found.lower[:, :n], found.upper[:, :n])
+    ends = torch.stack([side * j for side in second.bounds for j in (least, most)])
+    low = torch.nan_to_num(round_down(ends.amin(0)), nan=-torch.inf)
+    high = torch.nan_to_num(round_up(ends.amax(0)), nan=torch.inf)
+    return torch.where(most > 0, low, 0.0), torch.where(most > 0, high, 0.0)
 
 
 def run_smoothly(
@@ -110,24 +167,48 @@ def _watched(program: Program, state: IntervalForm, w: IntervalForm, numbers: In
     return IntervalForm(*(side.expand(*batch, -1) for side in found.bounds))
 
 
-def _flowed(
-    programs: Expansion, state: IntervalForm, stay: IntervalForm, control: IntervalForm | None, w: Box
-) -> IntervalForm:
-    """``B + [0, h] (f(X, U) + W)``; unbounded where f may jump."""
+@dataclass(frozen=True)
+class _Flowed:
+    """``B + [0, h] (f(X, U) + W)`` of a box X; unbounded where f may jump.
+
+    Where p may be in force, of both: of f with p or u under w, and of f with u under what moves the solutions of
+    constant disturbances.
+    """
+
+    programs: Expansion
+    state: IntervalForm
+    control: IntervalForm | None
+    w: Box
+    signal: Box
+    held: Held | None
+
+    def __call__(self, stay: IntervalForm) -> IntervalForm:
+        """Of X."""
+        low, high = rate_over(self.programs, stay, self.control, self.signal)
+        if self.held is not None:
+            slow, fast = rate_over(self.programs, stay, self.held.control, self.w)
+            low, high = torch.minimum(low, slow), torch.maximum(high, fast)
+        low, high = low.clamp(max=0.0) * self.programs.length, high.clamp(min=0.0) * self.programs.length
+        state = self.state
+        return IntervalForm(round_down(state.lower + round_down(low)), round_up(state.upper + round_up(high)))
+
+
+def rate_over(
+    programs: Expansion, stay: IntervalForm, control: IntervalForm | None, w: Box
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Bounds of ``f(X, U) + W``; infinite where f may jump."""
     found, smooth = run_smoothly(programs.rate, stay, IntervalForm(w.lower, w.upper), control)
     rate, smooth = found.next, smooth[..., None]
     low = torch.where(smooth, round_down(rate.lower + w.lower), -torch.inf)
-    high = torch.where(smooth, round_up(rate.upper + w.upper), torch.inf)
-    low, high = low.clamp(max=0.0) * programs.length, high.clamp(min=0.0) * programs.length
-    return IntervalForm(round_down(state.lower + round_down(low)), round_up(state.upper + round_up(high)))
+    return low, torch.where(smooth, round_up(rate.upper + w.upper), torch.inf)
 
 
-def _a_priori(programs: Expansion, state: IntervalForm, control: IntervalForm | None, w: Box) -> IntervalForm:
+def _a_priori(state: IntervalForm, flowed: _Flowed) -> IntervalForm:
     """A box that no solution leaves within the part, ``(N, n)``; infinite where none was found."""
-    trial = _widened(state, _flowed(programs, state, state, control, w))
+    trial = _widened(state, flowed(state))
     kept = torch.zeros(state.lower.shape[:-1], dtype=torch.bool)
     for _ in range(_ROUNDS):
-        after = _flowed(programs, state, trial, control, w)
+        after = flowed(trial)
         kept = ((trial.lower <= after.lower) & (after.upper <= trial.upper)).all(-1)
         kept &= torch.isfinite(trial.lower).all(-1) & torch.isfinite(trial.upper).all(-1)
         if bool(kept.all()):
@@ -173,12 +254,25 @@ def _swung(radius: Tensor, h: float) -> Tensor:
     return (0.75 * h * h * _MORE) * radius
 
 
-def _drift(slopes: IntervalForm, radius: Tensor, h: float) -> Tensor:
-    """``e >= A (3/4 h^2 r_W + h e)``; infinite where none was found."""
-    most, base = _largest(slopes), _swung(radius, h)
+def _pushed(programs: Expansion, inside: IntervalForm, held: Held, w: Box) -> Tensor:
+    """``d^2 / 2 |D_x (f(x, p) - f(x, u)) x'|``, d the seconds that p is in force for."""
+    assert programs.change is not None
+    low, high = rate_over(programs, inside, held.control, w)
+    parts = zip(held.control.bounds, held.less.bounds, (low, high), strict=True)
+    given = IntervalForm(*(torch.cat(sides, -1) for sides in parts))
+    nothing = torch.zeros(inside.lower.shape[-1], dtype=torch.float64)
+    turned = _watched(programs.change, inside, IntervalForm(nothing, nothing), given)
+    square = (held.most * programs.length) ** 2 / 2 * _MORE
+    return torch.where(held.most > 0, _number(square * torch.maximum(turned.lower.abs(), turned.upper.abs())), 0.0)
+
+
+def _drift(slopes: IntervalForm, swung: Tensor, pushed: Tensor, h: float) -> Tensor:
+    """``e >= pushed + A (swung + h e)``; infinite where none was found."""
+    most = _largest(slopes)
 
     def after(e: Tensor) -> Tensor:
-        return (most * (base + h * _MORE * e)[..., None, :]).sum(-1) * _MORE + TINY * (base.amax() > 0)
+        moved = (most * (swung + h * _MORE * e)[..., None, :]).sum(-1)
+        return (pushed + moved) * _MORE + TINY * (swung.amax() > 0)
 
     e = after(torch.zeros(most.shape[:-1], dtype=torch.float64))
     trial, kept = e, torch.zeros(most.shape[:-2], dtype=torch.bool)
@@ -191,8 +285,8 @@ def _drift(slopes: IntervalForm, radius: Tensor, h: float) -> Tensor:
     return torch.where(kept[..., None], trial, torch.inf)
 
 
-def _drift_at_the_end(slopes: IntervalForm, radius: Tensor, h: float, drift: Tensor) -> Tensor:
-    """``g = D 3/4 h^2 r_W + h A e``."""
-    moved = (slopes.upper - slopes.lower) * _swung(radius, h)[..., None, :]
+def _drift_at_the_end(slopes: IntervalForm, swung: Tensor, pushed: Tensor, h: float, drift: Tensor) -> Tensor:
+    """``g = pushed + D swung + h A e``."""
+    moved = (slopes.upper - slopes.lower) * swung[..., None, :]
     carried = _largest(slopes) * (h * _MORE * drift)[..., None, :]
-    return _number((moved + carried).sum(-1) * _MORE + TINY)
+    return _number((pushed + (moved + carried).sum(-1)) * _MORE + TINY)

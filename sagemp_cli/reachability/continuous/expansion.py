@@ -8,7 +8,12 @@ j, weighted towards its beginning and its end, ::
 where ``c_1 = f(x_j, u) + a_j, c_2, ...`` are the Taylor coefficients of ``z' = f(z, u) + a_j`` from x_j on. Bounds of
 ``r_j`` are found in :mod:`~sagemp_cli.reachability.continuous.enclosure`; ``docs/continuous_time.md`` has the proof.
 The step's disturbance is ``(a_1, b_1, r_1, ..., a_S, b_S, r_S)``; its output ``control`` is u and then
-``x_1, ..., x_{S-1}``.
+``x_2, ..., x_S``.
+
+A control that lags is part of the state: ``(x, p)`` with p the control before. What was measured is
+``x - j (f(x, p) + v) + e``, ``(j, v, e)`` the first of the disturbance. In the first L parts, which the delay reaches
+into, ``a_j`` and ``b_j`` are larger by shares of ``g_j = f(x_j, p) - f(x_j, u)``, which come after the remainder of
+their part; ``g_1, ..., g_L`` and ``p - u`` are watched as well.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
+from sagemp_cli.reachability.continuous.lagging import has_jitter, lagged_parts
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.continuous.series import Series, state_coefficients
 from sagemp_cli.reachability.continuous.writing import Writer
@@ -33,6 +39,10 @@ class Expansion:
         coefficients: of the state, the control as numbers and a constant w as disturbance; its output ``control`` is
             ``c_2`` and, of an order above 1, ``c_{p+1}``.
         tangent: of the state and, as numbers, the control and a direction v; its output ``control`` is ``Df v``.
+        change: of the state and, as numbers, the control, a change d of it and a direction v; its output ``control`` is
+            ``D_x (D_u f d) v``. None if no control lags.
+        lagged: parts of a period that the delay may reach into, L.
+        jitter: whether the control is of a state that is not that of the instant.
         division: how the period is cut.
         length: of a part, h; exact.
     """
@@ -41,8 +51,16 @@ class Expansion:
     rate: Program
     coefficients: Program
     tangent: Program
+    change: Program | None
+    lagged: int
+    jitter: bool
     division: Division
     length: float
+
+    @property
+    def lags(self) -> bool:
+        """Whether the control before is part of the state."""
+        return self.lagged > 0 or self.jitter
 
 
 @functools.lru_cache(maxsize=32)
@@ -67,17 +85,66 @@ def _tangent(rate: Program) -> Program:
     return out.finished(next=out.state, control=out.constant([0.0] * n) if slope is None else slope)
 
 
+@functools.lru_cache(maxsize=32)
+def _change(rate: Program) -> Program:
+    n, m = rate.states, rate.numbers
+    joint = Writer(n + m, 1)  # f of state and control as one
+    given = {"state": joint.pick(joint.state, 0, n), "numbers": joint.pick(joint.state, n, m)}
+    whole = joint.finished(next=joint.state, control=joint.embedded(rate, given).next)
+    turned = Writer(n + 2 * m, 1)
+    x, u, d = (turned.pick(turned.state, *part) for part in ((0, n), (n, m), (n + m, m)))
+    slope = _second(turned, whole, turned.join(x, u), turned.join(turned.constant([0.0] * n), d))
+    by_control = turned.finished(next=turned.state, control=slope)
+    out = Writer(n, n, 2 * m + n)
+    assert out.numbers is not None
+    numbers, v = out.pick(out.numbers, 0, 2 * m), out.pick(out.numbers, 2 * m, n)
+    state, along = out.join(out.state, numbers), out.join(v, out.constant([0.0] * 2 * m))
+    return out.finished(next=out.state, control=_second(out, by_control, state, along))
+
+
+def _second(out: Writer, program: Program, state: int, along: int) -> int:
+    """The slope of a program's output ``control`` along a direction."""
+    assert program.outputs.control is not None
+    series = Series(out, program, [state, along], None, program.outputs.control)
+    series.next_order()
+    slope = series.next_order()
+    size = program.instructions[program.outputs.control].size
+    return out.constant([0.0] * size) if slope is None else slope
+
+
 def expansion(loop: SampledLoop, division: Division) -> Expansion:
     """The programs of a loop."""
-    n, s, h = loop.state_dim, division.substeps, loop.period / division.substeps
-    out = Writer(n, 3 * n * s, loop.control.numbers)
+    n, m, s, h = loop.state_dim, loop.controls, division.substeps, loop.period / division.substeps
+    lagged, jitter = lagged_parts(loop.lag, loop.period, division), has_jitter(loop.lag)
+    lags = lagged > 0 or jitter
+    before = 1 + 2 * n if jitter else 0
+    out = Writer(n + m if lags else n, before + 3 * n * s + 2 * lagged, loop.control.numbers)
+    taken = 0
+
+    def disturbed(count: int) -> int:
+        nonlocal taken
+        taken += count
+        return out.pick(out.disturbance, taken - count, count)
+
+    x, held = (out.pick(out.state, 0, n), out.pick(out.state, n, m)) if lags else (out.state, None)
+    measured = x
+    if jitter:
+        older, w, rest = disturbed(1), disturbed(n), disturbed(n)
+        assert held is not None
+        back = out.of("mul", older, out.of("add", _rate(out, loop.rate, x, held), w))
+        measured = out.of("add", out.of("sub", x, back), rest)
     u = None
-    inputs = {"state": out.state} | ({} if out.numbers is None else {"numbers": out.numbers})
+    inputs = {"state": measured} | ({} if out.numbers is None else {"numbers": out.numbers})
     if loop.controls:
         u = out.embedded(loop.control, inputs).control
-    x, between = out.state, []
+    between, jumps = [], []
     for j in range(s):
-        a, b, r = (out.pick(out.disturbance, 3 * n * j + n * i, n) for i in range(3))
+        a, b, r = (disturbed(n) for _ in range(3))
+        if j < lagged:
+            assert held is not None and u is not None
+            first, last = disturbed(1), disturbed(1)
+            jumps.append(out.of("sub", _rate(out, loop.rate, x, held), _rate(out, loop.rate, x, u)))
+            a, b = (out.of("add", w, out.of("mul", share, jumps[-1])) for w, share in ((a, first), (b, last)))
         c = state_coefficients(out, loop.rate, x, u, a, division.order)
         total: int | None = None
         for coefficient in c[:0:-1]:  # Horner's rule
@@ -89,6 +156,25 @@ def expansion(loop: SampledLoop, division: Division) -> Expansion:
         assert total is not None  # c_1 holds a
         x = out.of("add", x, out.of("add", out.scaled(total, h), turned))
         between.append(x)
-    watched = [*([] if u is None else [u]), *between[:-1]]
-    step = out.finished(next=x, control=out.join(*watched) if watched else None)
-    return Expansion(step, loop.rate, _coefficients(loop.rate, division.order), _tangent(loop.rate), division, h)
+    watched = [*([] if u is None else [u]), *between[:-1], *jumps]
+    if lagged:
+        assert held is not None and u is not None
+        watched.append(out.of("sub", held, u))
+    after = out.join(x, u) if lags and u is not None else x
+    step = out.finished(next=after, control=out.join(*watched) if watched else None)
+    return Expansion(
+        step,
+        loop.rate,
+        _coefficients(loop.rate, division.order),
+        _tangent(loop.rate),
+        _change(loop.rate) if lagged else None,
+        lagged,
+        jitter,
+        division,
+        h,
+    )
+
+
+def _rate(out: Writer, rate: Program, x: int, u: int) -> int:
+    """f, as a value."""
+    return out.embedded(rate, {"state": x, "numbers": u}).next

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from sagemp_cli.reachability.affine.affine import Affine, AffineRun
 from sagemp_cli.reachability.affine.halving import Halving
-from sagemp_cli.reachability.continuous.enclosure import enclosure
+from sagemp_cli.reachability.continuous.enclosure import Held, enclosure, measured_rest
 from sagemp_cli.reachability.continuous.expansion import Expansion, expansion
+from sagemp_cli.reachability.continuous.lagging import Shares
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
 from sagemp_cli.reachability.flow import Division, Flow
 from sagemp_cli.reachability.interval.form import IntervalForm
@@ -60,18 +61,20 @@ class _Block:
     Attributes:
         run: with guessed remainders.
         flow: with these.
-        needed: what they have to contain, ``(2, C, K, S, n)``.
+        guess: of the remainders of all parts and then, of a control that lags, of what was measured,
+            ``(2, C, K, S + 1, n)``.
+        needed: what they have to contain, likewise.
     """
 
     run: AffineRun
     flow: Flow
+    guess: Tensor
     needed: Tensor
 
     @property
     def holds(self) -> Tensor:
         """Whether they do, ``(C, K)``."""
-        low, high = self.needed
-        inside = (self.flow.remainder_lower <= low) & (high <= self.flow.remainder_upper)
+        inside = (self.guess[0] <= self.needed[0]) & (self.needed[1] <= self.guess[1])
         return inside.flatten(2).all(-1)
 
     @property
@@ -87,13 +90,7 @@ class _Block:
         low, high = self.needed
         more = _MARGIN * (high - low) + TINY
         known = torch.isfinite(self.needed).all(0)
-        guess = torch.stack(
-            [
-                torch.where(known, low - more, self.flow.remainder_lower),
-                torch.where(known, high + more, self.flow.remainder_upper),
-            ]
-        )
-        return guess.transpose(1, 2)
+        return torch.where(known, torch.stack([low - more, high + more]), self.guess).transpose(1, 2)
 
     def extrapolated(self) -> Tensor:
         """A guess for the periods that follow, ``(2, 1, C, S, n)``."""
@@ -115,17 +112,23 @@ def propagated(
     """
     programs = expansion(loop, division)
     cells, n, s = start.lower.shape[0], loop.state_dim, division.substeps
+    if programs.lags:  # of a control before the first there is none: 0 stands for it and moves nothing
+        nothing = torch.zeros(cells, loop.controls, dtype=torch.float64)
+        start = Box(torch.cat([start.lower, nothing], -1), torch.cat([start.upper, nothing], -1))
     blocks: list[_Block] = []
     states: Zonotope | None = None
     halving = Halving(start) if foresee else None
-    guess = torch.zeros(2, 1, cells, s, n, dtype=torch.float64)
+    guess = torch.zeros(2, 1, cells, s + programs.jitter, n, dtype=torch.float64)
     failed = torch.full((cells,), loop.horizon)
     at, length, here = 0, _FIRST, start
     while at < loop.horizon:
         stop = min(at + length, loop.horizon)
         part = RecordedLoop((programs.step,), loop.numbers[at:stop], stop - at)
         signal = w if w.lower.dim() == 1 else Box(w.lower[at:stop], w.upper[at:stop])
-        block = _block(affine, part, programs, here, _Begin(states, halving), signal, guess)
+        given = _Given(
+            part, programs, here, _Begin(states, halving), signal, *_lag(loop, programs, at, stop, w, blocks)
+        )
+        block = _block(affine, given, guess)
         blocks.append(block)
         bad = ~block.holds
         first = torch.where(bad.any(1), bad.to(torch.int8).argmax(1) + at, loop.horizon)
@@ -140,7 +143,8 @@ def propagated(
     between = Flow.join([b.flow for b in blocks], 1)
     assert between is not None
     between = between.padded(rest).known_until(failed)
-    tube = Tube(*(torch.nn.functional.pad(side, (0, 0, 0, rest)) for side in (run.tube.lower, run.tube.upper)))
+    sides = (run.tube.lower[..., :n], run.tube.upper[..., :n])
+    tube = Tube(*(torch.nn.functional.pad(side, (0, 0, 0, rest)) for side in sides))
     lost = (torch.arange(loop.horizon + 1) > failed[:, None])[..., None]
     tube = Tube(torch.where(lost, -torch.inf, tube.lower), torch.where(lost, torch.inf, tube.upper))
     return FlowRun(dataclasses.replace(run, tube=tube, bands=[] if rest else run.bands), between, failed)
@@ -158,72 +162,202 @@ def _settled(side: Tensor) -> Tensor:
     return torch.nan_to_num(side, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _block(
-    affine: Affine,
-    part: RecordedLoop,
-    programs: Expansion,
-    start: Box,
-    begin: _Begin,
-    w: Box,
-    guess: Tensor,
-) -> _Block:
+@dataclass(frozen=True)
+class _Given:
+    """What is known of some periods before they are propagated.
+
+    Attributes:
+        part: their steps.
+        programs: of the loop.
+        start: box of the states, ``(C, n)``; of a control that lags, with the control before.
+        begin: what else is known of them.
+        w: W, ``(n,)`` or of each period.
+        shares: what a lag leaves of every part to the control before; None if there is none.
+        earlier: of the period before the first of these, W ``(n,)`` and boxes that the flow did not leave,
+            ``(C, S, n)``, where what is measured may be of that time.
+    """
+
+    part: RecordedLoop
+    programs: Expansion
+    start: Box
+    begin: _Begin
+    w: Box
+    shares: Shares | None
+    earlier: tuple[Box, Box] | None
+
+
+def _lag(
+    loop: SampledLoop, programs: Expansion, at: int, stop: int, w: Box, blocks: Sequence[_Block]
+) -> tuple[Shares | None, tuple[Box, Box] | None]:
+    """The last two of :class:`_Given`, of periods from ``at`` on."""
+    if loop.lag is None or not programs.lags:
+        return None, None
+    shares = Shares.of(loop.lag, at, stop, loop.period, programs.division)
+    if not at or not programs.jitter:
+        return shares, None
+    before = w if w.lower.dim() == 1 else Box(w.lower[at - 1], w.upper[at - 1])
+    flow = blocks[-1].flow
+    return shares, (before, Box(flow.lower[:, -1], flow.upper[:, -1]))
+
+
+def _block(affine: Affine, given: _Given, guess: Tensor) -> _Block:
     """Some periods in a row, beginning with ``guess (2, 1 or K, C, S, n)`` of their remainders."""
     for _ in range(_ATTEMPTS - 1):
-        block = _attempt(affine, part, programs, start, begin, w, guess)
+        block = _attempt(affine, given, guess)
         if bool(block.settled.all()):
             return block
         guess = block.widened()
-    return _attempt(affine, part, programs, start, begin, w, guess)
+    return _attempt(affine, given, guess)
 
 
-def _attempt(
-    affine: Affine, part: RecordedLoop, programs: Expansion, start: Box, begin: _Begin, w: Box, guess: Tensor
-) -> _Block:
+def _attempt(affine: Affine, given: _Given, guess: Tensor) -> _Block:
     """The same with one guess."""
-    cells, n = start.lower.shape
-    s, steps = programs.division.substeps, part.horizon
-    guess = guess.expand(2, steps, cells, s, n)
+    programs, part, w, shares = given.programs, given.part, given.w, given.shares
+    cells, n, s, steps = len(given.start.lower), programs.rate.states, programs.division.substeps, part.horizon
+    guess = guess.expand(2, steps, *guess.shape[2:])
     signal = [
         (side if side.dim() == 3 else side.expand(steps, n)[:, None])[:, None].expand(steps, cells, s, n)
         for side in (w.lower, w.upper)
     ]
-    sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
-    run = affine.run(part, start, Box(*sides), watch=True, states=begin.states, intervals=False, halving=begin.halving)
-    state, control = _boxes(run, n, s)
+    if shares is None:
+        sides = [torch.cat([side, side, g], -1).flatten(-2) for side, g in zip(signal, guess, strict=True)]
+    else:
+        if programs.jitter:  # what is measured at once is the state
+            older = (shares.jitter[1] > 0)[:, None, None, None]
+            guess = torch.cat([guess[:, :, :, :s], torch.where(older, guess[:, :, :, s:], 0.0)], 3)
+        sides = [_lagging(given, shares, guess[i], i) for i in (0, 1)]
+    run = affine.run(
+        part,
+        given.start,
+        Box(*sides),
+        watch=True,
+        states=given.begin.states,
+        intervals=False,
+        halving=given.begin.halving,
+    )
+    state, control = _boxes(run, n, programs.rate.numbers, s)
+    held = None if shares is None else _held(run, shares, programs)
     each = Box(*(side.transpose(0, 1).reshape(-1, n) for side in signal))
-    found = enclosure(programs, state, control, w if w.lower.dim() == 1 else each)
+    found = enclosure(programs, state, control, w if w.lower.dim() == 1 else each, held)
 
     def shaped(side: Tensor) -> Tensor:
         return side.reshape(cells, steps, s, n)
 
-    given = guess.transpose(1, 2)
+    needed = torch.stack([shaped(found.remainder_lower), shaped(found.remainder_upper)])
+    if programs.jitter:
+        assert shares is not None
+        rest = _measured(run, given, shares, shaped(found.lower), shaped(found.upper))
+        needed = torch.cat([needed, torch.stack(rest)[:, :, :, None]], 3)
+    own = guess.transpose(1, 2)
+    none = torch.zeros(cells, steps, 1, n, dtype=torch.float64)
+    measured = own[:, :, :, s:] if programs.jitter else torch.stack([none, none])
     between = Flow(
         programs.division,
         shaped(state.lower),
         shaped(state.upper),
         shaped(found.lower),
         shaped(found.upper),
-        given[0],
-        given[1],
+        own[0, :, :, :s],
+        own[1, :, :, :s],
         shaped(found.curve),
         shaped(found.drift),
+        torch.zeros(cells, steps, s, n, dtype=torch.float64) if held is None else shaped(held.jump),
+        measured[0],
+        measured[1],
     )
-    return _Block(run, between, torch.stack([shaped(found.remainder_lower), shaped(found.remainder_upper)]))
+    return _Block(run, between, own, needed)
 
 
-def _boxes(run: AffineRun, n: int, s: int) -> tuple[IntervalForm, IntervalForm | None]:
+def _lagging(given: _Given, shares: Shares, guess: Tensor, side: int) -> Tensor:
+    """A side of the disturbance of periods whose control lags, ``(K, C, d)``; of a guess ``(K, C, S + 1, n)``."""
+    steps, cells, _, n = guess.shape
+    s, w = given.programs.division.substeps, _side(given.w, side).expand(steps, n)
+    signal, found = w[:, None].expand(steps, cells, n), []
+    if given.programs.jitter:
+        first = w[:1] if given.earlier is None else _side(given.earlier[0], side)[None]
+        before = torch.cat([first, w[:-1]])[:, None].expand(steps, cells, n)
+        found += [shares.jitter[side][:, None, None].expand(steps, cells, 1), before, guess[:, :, s]]
+    for j in range(s):
+        found += [signal, signal, guess[:, :, j]]
+        if j < shares.parts:
+            found.append((shares.means.lower, shares.means.upper)[side][:, None, j].expand(steps, cells, 2))
+    return torch.cat(found, -1)
+
+
+def _boxes(run: AffineRun, n: int, m: int, s: int) -> tuple[IntervalForm, IntervalForm | None]:
     """States at the beginning of every part and controls of it, ``(C K S, ...)``."""
-    lower, upper = run.tube.lower[:, :-1, None], run.tube.upper[:, :-1, None]
+    lower, upper = run.tube.lower[:, :-1, None, :n], run.tube.upper[:, :-1, None, :n]
     if run.watched_lower is None or run.watched_upper is None:
         return IntervalForm(lower.reshape(-1, n), upper.reshape(-1, n)), None
     states, controls = [], []
     for side, watched in ((lower, run.watched_lower), (upper, run.watched_upper)):
-        m = watched.shape[-1] - (s - 1) * n
-        states.append(torch.cat([side, watched[..., m:].unflatten(-1, (s - 1, n))], 2) if s > 1 else side)
+        inner = watched[..., m : m + (s - 1) * n].unflatten(-1, (s - 1, n)) if s > 1 else side[:, :, :0]
+        states.append(torch.cat([side, inner], 2))
         controls.append(watched[..., None, :m].expand(*watched.shape[:-1], s, m))
     state = IntervalForm(*(side.reshape(-1, n) for side in states))
-    m = controls[0].shape[-1]
     return state, IntervalForm(*(side.reshape(-1, m) for side in controls)) if m else None
+
+
+def _held(run: AffineRun, shares: Shares, programs: Expansion) -> Held | None:
+    """What the control before may do in every part, ``(C K S, ...)``; None if there is no delay."""
+    lagged, s, n, m = programs.lagged, programs.division.substeps, programs.rate.states, programs.rate.numbers
+    if not lagged or run.watched_lower is None or run.watched_upper is None:
+        return None
+    watched = run.watched_lower, run.watched_upper
+    rows = watched[0].shape[:-1]
+    there = torch.nn.functional.pad(shares.most, (0, s - lagged))[..., None] > 0
+
+    def spread(share: Tensor) -> Tensor:
+        whole = torch.nn.functional.pad(share, (0, s - lagged))[..., None]
+        return whole.expand(*rows, s, 1).reshape(-1, 1)
+
+    def parts(sides: Sequence[Tensor], missing: Sequence[Tensor]) -> IntervalForm:
+        return IntervalForm(
+            *(
+                torch.where(there, a, b).expand(*rows, s, a.shape[-1]).reshape(-1, a.shape[-1])
+                for a, b in zip(sides, missing, strict=True)
+            )
+        )
+
+    first = m + (s - 1) * n
+    control = [side[..., None, :m] for side in watched]
+    before = [side[..., :-1, None, n:] for side in (run.tube.lower, run.tube.upper)]
+    both = torch.minimum(control[0], before[0]), torch.maximum(control[1], before[1])
+    none = [torch.zeros(1, dtype=torch.float64)] * 2
+    less = parts([side[..., None, first + lagged * n :] for side in watched], none)
+    low, high = (side[..., first : first + lagged * n].unflatten(-1, (lagged, n)) for side in watched)
+    jump = torch.nn.functional.pad(torch.maximum(low.abs(), high.abs()), (0, 0, 0, s - lagged))
+    return Held(
+        parts(both, control),
+        less,
+        torch.where(there, torch.nan_to_num(jump, nan=torch.inf, posinf=torch.inf), 0.0).reshape(-1, n),
+        spread(shares.most),
+        spread(shares.means.upper[..., 0]),
+        spread(shares.swing),
+    )
+
+
+def _measured(run: AffineRun, given: _Given, shares: Shares, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """What is left out of measured states, ``(C, K, n)``, of boxes that flows stay in, ``(C, K, S, n)``."""
+    cells, steps, s, n = lower.shape
+    period = given.programs.length * s
+    since = shares.since(period, s)
+    sides, signals = [], []
+    for i, side in enumerate((lower, upper)):
+        first = side[:, :1] if given.earlier is None else _side(given.earlier[1], i)[:, None]
+        before = torch.cat([first, side[:, :-1]], 1)[:, :, since:]
+        sides.append((before.amax(2) if i else before.amin(2)).reshape(-1, n))
+        w = _side(given.w, i).expand(steps, n)
+        row = w[:1] if given.earlier is None else _side(given.earlier[0], i)[None]
+        signals.append(torch.cat([row, w[:-1]]).expand(cells, steps, n).reshape(-1, n))
+    control = IntervalForm(*(t[:, :-1, n:].reshape(cells * steps, -1) for t in (run.tube.lower, run.tube.upper)))
+    older = [side.expand(cells, steps).reshape(-1, 1) for side in shares.jitter]
+    rest = measured_rest(given.programs, IntervalForm(*sides), control, Box(*signals), (older[0], older[1]))
+    return rest[0].reshape(cells, steps, n), rest[1].reshape(cells, steps, n)
+
+
+def _side(box: Box, side: int) -> Tensor:
+    return box.upper if side else box.lower
 
 
 def _joined(runs: Sequence[AffineRun]) -> AffineRun:

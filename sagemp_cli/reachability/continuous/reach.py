@@ -15,6 +15,7 @@ from sagemp_cli.reachability.continuous.expansion import expansion
 from sagemp_cli.reachability.continuous.propagation import FlowRun, propagated
 from sagemp_cli.reachability.continuous.sampled import Sampled, SampledLoop, sampled
 from sagemp_cli.reachability.flow import Division
+from sagemp_cli.reachability.halves import Halves
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.sets import Box
@@ -73,6 +74,10 @@ def reach_continuously(
         raise UsageError(f"the period must be a positive number of seconds, found {known.period}")
     if substeps is not None and (substeps < 1 or substeps & (substeps - 1)):
         raise UsageError(f"substeps must be a power of two, found {substeps}")
+    if known.lag is not None and not known.controls:
+        raise UsageError("a control that lags is said of a loop that has no control")
+    if known.lag is not None and w.lower.dim() > 2:
+        raise UsageError("of a control that lags the disturbance may change from period to period, not within one")
     if order < 1:
         raise UsageError(f"order must be at least 1, found {order}")
     best: FlowRun | None = None
@@ -83,16 +88,18 @@ def reach_continuously(
         if left == 0 or known.horizon - left > 0 and left > _PROGRESS * before:
             break
     assert best is not None
-    halving = best.run.halving
-    return dataclasses.replace(_result(best, known), halves=None if halving is None else halving.halves(known.horizon))
+    halves = None if best.run.halving is None else best.run.halving.halves(known.horizon)
+    if halves is not None:  # a control before that is part of the state is not a side of a cell
+        halves = Halves(*(side[:, :n, :, :n] for side in (halves.shift, halves.narrowing)))
+    return dataclasses.replace(_result(best, known), halves=halves)
 
 
 def polynomial_steps(loop: Sampled | SampledLoop, start: Box, w: Box) -> tuple[RecordedLoop, Box]:
-    """The loop as steps of Taylor polynomials without their remainders, with their disturbance: no proof.
+    """The loop as steps of Taylor polynomials without their remainders or a lag, with their disturbance: no proof.
 
     What comes out is differentiable by weights of the loop, where autograd is on.
     """
-    known = sampled(loop, start)
+    known = dataclasses.replace(sampled(loop, start), lag=None)
     step = expansion(known, Division(1, ORDER)).step
     nothing = torch.zeros_like(w.lower)
     sides = (torch.cat([side, side, nothing]) for side in (w.lower, w.upper))

@@ -14,7 +14,7 @@ from sagemp_cli.sets import Box
 
 
 class Sampled(Protocol):
-    """A loop that says its ODE and its control apart."""
+    """A loop that says its ODE and its control apart; a ``lag`` as :class:`SampledLoop` has it may be there too."""
 
     @property
     def horizon(self) -> int:
@@ -48,12 +48,17 @@ class Sampled(Protocol):
 class SampledLoop:
     """``x'(t) = f(x(t), u_k) + w(t)`` and ``u_k = c_k(x(t_k))`` for t in period k; w is any measurable signal in W.
 
+    With a lag ``u_k = c_k(x(t_k - j_k))`` is in force from ``t_k + d_k`` to ``t_{k+1} + d_{k+1}``, whatever ``d_k`` and
+    ``j_k`` are within their bounds, but for the first: ``d_0 = j_0 = 0``.
+
     Attributes:
         control: reads the state and the instant's numbers; its output ``control`` is u, its ``next`` the state itself.
         rate: f; reads the state and, as its numbers, u. Its output ``next`` is ``x' - w``. Neither reads a disturbance.
         numbers: of each instant, ``(K, ..., g)``; dimensions between are a batch of loops.
         horizon: periods K.
         period: seconds, taken as exact.
+        lag: bounds of delay d and jitter j in seconds, together at most a period, ``(2,)`` or of each period
+            ``(K, 2)``; None if there is none.
     """
 
     control: Program
@@ -61,6 +66,7 @@ class SampledLoop:
     numbers: Tensor
     horizon: int
     period: float
+    lag: Box | None = None
 
     @property
     def state_dim(self) -> int:
@@ -77,9 +83,12 @@ class SampledLoop:
         """Number of controls m."""
         return self.rate.numbers
 
-    def part(self, first: int, stop: int) -> SampledLoop:
-        """Some of its periods."""
-        return replace(self, numbers=self.numbers[first:stop], horizon=stop - first)
+    def beginning(self, periods: int) -> SampledLoop:
+        """Its first periods."""
+        lag = self.lag
+        if lag is not None and lag.lower.dim() > 1:
+            lag = Box(lag.lower[:periods], lag.upper[:periods])
+        return replace(self, numbers=self.numbers[:periods], horizon=periods, lag=lag)
 
 
 def sampled(loop: Sampled | SampledLoop, start: Box) -> SampledLoop:
@@ -102,4 +111,4 @@ def sampled(loop: Sampled | SampledLoop, start: Box) -> SampledLoop:
     with torch.no_grad():
         u = loop.control_given(example, x)
     rate = record(lambda x, w, u: loop.rate(x, u), x, nothing, u)
-    return SampledLoop(control, rate, numbers, loop.horizon, float(loop.period))
+    return SampledLoop(control, rate, numbers, loop.horizon, float(loop.period), getattr(loop, "lag", None))

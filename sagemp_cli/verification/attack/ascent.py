@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Box
 
@@ -29,6 +30,8 @@ class Rollouts:
 
 def simulate(loop: Loop, start: Tensor, disturbances: Tensor) -> Tensor:
     """States ``(..., K+1, n)`` from starts ``(..., n)`` under disturbances ``(..., K, d)``."""
+    if isinstance(loop, ClosedLoop):  # of which a step may depend on the one before
+        return loop.rollout(start, disturbances)[0]
     states = [start]
     for k in range(loop.horizon):
         states.append(loop.step(k, states[-1], disturbances[..., k, :]))

@@ -28,7 +28,7 @@ class Counterexample:
 
     Attributes:
         start: ``(n,)``, inside the start box.
-        disturbances: ``(K, d)``, each inside the disturbance box.
+        disturbances: ``(K, d)``, each inside the disturbance box and, in two columns more, the bounds of a lag.
         states: the replayed states ``(K+1, n)``, in float64.
         kind: ``"workspace"``, ``"obstacle"`` or ``"goal"``.
         name: the obstacle's name, or the kind again.
@@ -92,7 +92,7 @@ def replay(loop: Loop, start: Tensor, disturbances: Tensor, problem: Problem) ->
         start, disturbances: the rollout.
         problem: what is claimed, with X_I ``(n,)``; the loop may be another one than that of its robot.
     """
-    start, disturbances = _into(inner(problem.start), start), _into(inner(problem.disturbance), disturbances)
+    start, disturbances = _into(inner(problem.start), start), _into(inner(problem.unknowns), disturbances)
     scene = problem.scene
     with torch.no_grad():
         states = simulate(loop, start, disturbances)
@@ -147,7 +147,7 @@ def falsify(
     """
     if restarts < 1:
         raise UsageError(f"falsifier: restarts must be a positive integer, found {restarts}")
-    start, disturbance = problem.start, problem.disturbance
+    start, disturbance = problem.start, problem.unknowns
     if start.lower.dim() > 2:
         raise UsageError(f"falsifier: start must have shape (n,) or (R, n), found {tuple(start.lower.shape)}")
     if isinstance(loop, ClosedLoop) and loop.references.dim() > 2:

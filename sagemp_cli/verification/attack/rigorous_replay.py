@@ -8,6 +8,7 @@ fraction s of a step, where the state is ``(1 - s) x_k + s x_{k+1}``, with s a n
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import cast
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from sagemp_cli.problem import Problem
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.continuous.reach import reach_continuously
-from sagemp_cli.reachability.continuous.sampled import Sampled
+from sagemp_cli.reachability.continuous.sampled import Sampled, sampled
 from sagemp_cli.reachability.propagator import Loop
 from sagemp_cli.sets import Between, Box, Bulge, Tube, round_down, round_up
 from sagemp_cli.sets.between import at_fraction, exact_fraction
@@ -79,11 +80,12 @@ class Replay:
             loop: what steps; may be another one than that of the problem's robot.
             start: ``(n,)``, in :func:`inner` of X_I. In a dimension so narrow that its inner points are not known the
                 start is anywhere in it.
-            disturbances: ``(K, d)``, in :func:`inner` of W; if W has so narrow a dimension, nothing is certain.
+            disturbances: ``(K, d)``, in :func:`inner` of W; if W has so narrow a dimension, nothing is certain. Of a
+                control that lags with the seconds of delay and jitter of every period.
             problem: what is claimed.
         """
         around, loose = problem.start, _unknown(problem.start)
-        if bool(_unknown(problem.disturbance).any()):
+        if bool(_unknown(problem.unknowns).any()):
             return cls(problem, None)
         first = Box(torch.where(loose, around.lower, start), torch.where(loose, around.upper, start))
         if problem.between is Between.CONTINUOUS:
@@ -94,8 +96,12 @@ class Replay:
     @classmethod
     def _of_solution(cls, loop: Sampled, start: Box, disturbances: Tensor, problem: Problem) -> Replay:
         """In continuous time, with a signal that is constant on every period."""
-        cell, w = Box(start.lower[None], start.upper[None]), Box(disturbances, disturbances)
-        found = reach_continuously(Affine(), loop, cell, w, order=_ORDER)
+        cell, n, parts, order = Box(start.lower[None], start.upper[None]), start.dim, None, _ORDER
+        w, known = Box(disturbances[:, :n], disturbances[:, :n]), sampled(loop, start)
+        if problem.dynamics.lag:
+            known = dataclasses.replace(known, lag=Box(disturbances[:, n:], disturbances[:, n:]))
+            parts, order = _LAG_PARTS, _LAG_ORDER
+        found = reach_continuously(Affine(), known, cell, w, substeps=parts, order=order)
         if found.flow is None:
             return cls(problem, None)
         tube = Tube(found.tube.lower[0], found.tube.upper[0])
@@ -179,6 +185,9 @@ class Replay:
 _HALVINGS = 25
 _ORDER = 5
 """Degree of the Taylor polynomials, in continuous time: one rollout costs little, and is to be known closely."""
+_LAG_PARTS, _LAG_ORDER = 4, 3
+"""Parts of a period whose control lags, and degree: what is left out where one control follows another falls with the
+parts' length, and not with the degree."""
 
 
 def _unknown(box: Box) -> Tensor:

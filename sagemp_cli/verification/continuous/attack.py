@@ -218,7 +218,7 @@ def _replayed(loop: SampledLoop, x: Tensor, v: Tensor, one: Asked) -> Violation:
         parts = max(division.substeps, signal.shape[1])
         each = signal.repeat_interleave(parts // signal.shape[1], 1)
         found = reach_continuously(
-            Affine(), loop.part(0, upto), point, Box(each, each), substeps=parts, order=division.order
+            Affine(), loop.beginning(upto), point, Box(each, each), substeps=parts, order=division.order
         )
         broken_at = _surely(one, loop, found)
         if broken_at is not None:

@@ -1,0 +1,169 @@
+"""Certificates of controls that lag: proved, printed as that, and no more believed than others."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from sagemp_cli.checker.check import check
+from sagemp_cli.checker.claim import claim_rows
+from sagemp_cli.errors import ArtifactError
+from sagemp_cli.pipeline.against import differences
+from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
+from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.sets import Box
+from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
+from sagemp_cli.verification.cells import CellProver
+from sagemp_cli.verification.verification import verify_references
+
+from .conftest import make_case
+from .continuous import flow_case
+
+
+def lag(delay, jitter):
+    return Box(*(torch.tensor([d, j], dtype=torch.float64) for d, j in zip(delay, jitter, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    where = tmp_path_factory.mktemp("lag") / "certificate.h5"
+    flow_case(where, horizon=3, lag=lag((0.0, 0.12), (0.005, 0.02)))
+    return where
+
+
+@pytest.mark.parametrize(
+    ("late", "options"),
+    [
+        (lag((0.0, 0.05), (0.0, 0.0)), {"substeps": 1}),
+        (lag((0.1, 0.1), (0.0, 0.0)), {"substeps": 4, "order": 3}),
+        (lag((0.0, 0.0), (0.0, 0.03)), {"substeps": 2, "order": 1}),
+        (lag((0.02, 0.2), (0.0, 0.0)), {"substeps": 2}),
+    ],
+)
+def test_a_lagging_control_is_proved_again(late, options, tmp_path):
+    path = tmp_path / "certificate.h5"
+    flow_case(path, horizon=3, lag=late, **options)
+    report = check(path)
+    assert report.answer == "VERIFIED", report.findings[0].reason
+
+
+def test_the_claim_says_when_the_control_is_measured_and_in_force(path, tmp_path):
+    assert check(path).answer == "VERIFIED"
+    rows = dict(claim_rows(check(path).document))
+    assert rows["control"].startswith(
+        "of x(t_k - j_k), t_k = k dt, j_k in [0.005, 0.02] s; in force from t_k + d_k, d_k in [0.0, 0.12] s, on until "
+        "the next one is; whatever each of them is, but d_0 = j_0 = 0; "
+    )
+    plain = tmp_path / "plain.h5"
+    flow_case(plain, horizon=3)
+    assert dict(claim_rows(check(plain).document))["control"].startswith("of x(t_k) at t_k = k dt, held on ")
+
+
+def put(name, index, value):
+    def change(file):
+        data = file[f"data/tubes/flow/{name}"]
+        data[index] = value(data[index])
+
+    return change
+
+
+def bounds(delay, jitter):
+    def change(file):
+        file["data/loop/lag"][...] = [delay, jitter]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            put("jump", (0, 2, 1, 2), lambda v: v * 0.5),
+            "cell 0, step 2: part 1: a late control changes the rate of",
+        ),
+        (put("jump", (1, 1, 0, 2), lambda v: -v), "cell 1, step 1: part 0: a late control changes the rate of state 2"),
+        (put("jump", (0, 0, 0, 2), lambda v: 1.0), "cell 0, step 0: part 0: a control is said to change that is not"),
+        (put("drift", (0, 1, 0, 0), lambda v: v * 0.5), "cell 0, step 1: part 0: state 0 may drift farther"),
+        (put("upper", (1, 2, 0, 1), lambda v: v - 0.02), "cell 1, step 2: part 0: the flow of state 1"),
+        (put("remainder_upper", (0, 1, 1, 0), lambda v: v * 0.5), "cell 0, step 1: part 1: the remainder of state 0"),
+        (put("curve", (0, 1, 0, 0), lambda v: v * 0.3), "cell 0, step 1: part 0: the path of state 0 may bend more"),
+        (put("measured_upper", (1, 2, 0), lambda v: v * 0.1 - 1e-9), "step 2: what is left out of the measured state"),
+        (put("measured_lower", (0, 1, 1), lambda v: 1e-9), "step 1: what is left out of the measured state 1"),
+        (put("measured_lower", (0, 1, 1), lambda v: np.nan), "finite"),
+        (put("jump", (0, 1, 0, 0), lambda v: np.inf), "finite"),
+        (bounds([0.0, 0.13], [0.005, 0.02]), ""),
+        (bounds([0.0, 0.12], [0.005, 0.03]), ""),
+        (bounds([0.0, 0.12], [0.0, 0.02]), ""),
+    ],
+)
+def test_what_is_not_so_is_not_proved(change, message, path, mutate, tmp_path):
+    report = check(mutate(path, tmp_path / "mutant.h5", change))
+    assert report.answer == "UNKNOWN" and message in report.findings[0].reason
+
+
+def without(name):
+    return lambda file: file.__delitem__(name)
+
+
+@pytest.mark.parametrize("name", ["data/tubes/flow/jump", "data/tubes/flow/measured_upper"])
+def test_bounds_that_are_not_there_are_none(name, path, mutate, tmp_path):
+    assert check(mutate(path, tmp_path / "mutant.h5", without(name))).answer == "UNKNOWN"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without("data/loop/lag"), "relaxations/slope must be float64 of shape"),
+        (bounds([0.0, 0.19], [0.0, 0.02]), "more than a period"),
+        (bounds([0.05, 0.04], [0.0, 0.02]), "no two intervals"),
+        (bounds([0.0, np.nan], [0.0, 0.02]), "no two intervals"),
+        (bounds([-0.01, 0.1], [0.0, 0.02]), "no two intervals"),
+        (bounds([0.0, 0.0], [0.0, 0.02]), "must be float64 of shape"),
+    ],
+)
+def test_a_lag_that_is_none_is_refused(change, message, path, mutate, tmp_path):
+    with pytest.raises(ArtifactError, match=message):
+        check(mutate(path, tmp_path / "mutant.h5", change))
+
+
+def test_a_lag_without_continuous_time_is_refused(certificate, mutate, tmp_path):
+    def late(file: h5py.File) -> None:
+        file["data/loop"].create_dataset("lag", data=np.zeros((2, 2)))
+
+    with pytest.raises(ArtifactError, match="continuous"):
+        check(mutate(certificate, tmp_path / "mutant.h5", late))
+
+
+def test_our_own_robots_lag_and_a_check_holds_that_against_what_is_asked(tmp_path):
+    case = make_case(time="continuous", lag={"delay": 0.03, "jitter": 0.01})
+    report = check(case.write(tmp_path / "certificate.h5"))
+    assert report.answer == "VERIFIED"
+    asked = case.config | {"dynamics": case.config["dynamics"] | {"delay": [0.01, 0.02], "jitter": 0.02}}
+    found = {d.what: (d.proved, d.asked, d.covers) for d in differences(report, asked)}
+    assert found["delay"] == ("0 to 0.03 s", "0.01 to 0.02 s", True)
+    assert found["jitter"] == ("0 to 0.01 s", "0 to 0.02 s", False)
+
+
+def test_what_the_attack_refutes_under_a_lag_the_checker_refutes(tmp_path):
+    late = {"delay": [0.02, 0.05], "jitter": [0.0, 0.02]}
+    made = make_case(time="continuous", disc=[0.4, 0.45], lag=late)
+    found = verify_references(
+        CellProver(Affine(), made.problem, made.tracker), torch.from_numpy(made.tubes.references), counts=[2, 1]
+    )
+    refuted = attack(
+        found, made.problem, tracker=made.tracker, generator=torch.Generator().manual_seed(0),
+        options=FalsifierOptions(restarts=2),
+    )  # fmt: skip
+    ((r, example),) = refuted.counterexamples
+    assert example.disturbances.shape == (8, 6) and example.disturbances[:, 4].max() > 0.02
+    record = counterexample_record(r, example, "disc")
+    write = {"tubes": tubes_record(refuted.verification), "verdict": "FALSIFIED"}
+    path = made.write(tmp_path / "certificate.h5", counterexamples=(record,), **write)
+    report = check(path)
+    assert report.answer == "FALSIFIED" and report.counterexamples == ((0, ""),)
+    late = record.disturbances.copy()
+    late[3, 4] = 0.06
+    path = made.write(tmp_path / "other.h5", counterexamples=(dataclasses.replace(record, disturbances=late),), **write)
+    assert check(path).counterexamples == ((0, "its delays and jitters are not within their bounds"),)
