@@ -17,7 +17,7 @@ from sagemp_cli.reachability.flow import Division
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.sets import Box
 
-ENOUGH = 0.04
+ENOUGH = 0.05
 """Share of the tube's width that the remainders of a period may have, to begin with."""
 
 FINE = 0.002
@@ -33,9 +33,13 @@ TRIED = 4
 FLOOR = 0.01
 """A tube that is narrower than this share of how far it goes counts as that wide, before anything says otherwise."""
 
+_NOTHING = 1e-200
+"""What only keeps rounding honest where a remainder is 0."""
+
 
 def remainder_share(reach: Reach, floor: float = 0.0) -> Tensor:
-    """Of each cell, widths of the remainders of a period beside those of the tube, of the worst state; ``(C,)``.
+    """Of each cell, the share ``r / (r + b)`` that remainders of width r in a period have beside a tube of width b, the
+    mean over states; ``(C,)``. One state that hardly varies, and of which remainders are all, does not decide.
 
     The median over the periods that have an enclosure, so that where a tube explodes in the end, what it did before
     counts; infinite where there is none. A width counts as at least ``floor`` times how far the tube goes.
@@ -47,9 +51,9 @@ def remainder_share(reach: Reach, floor: float = 0.0) -> Tensor:
     known = torch.isfinite(left_out) & torch.isfinite(lower) & torch.isfinite(upper)
     top, bottom = torch.where(known, upper, -torch.inf).amax(1), torch.where(known, lower, torch.inf).amin(1)
     width = torch.maximum(upper - lower, floor * (top - bottom)[:, None])
-    share = torch.where(left_out == 0, 0.0, left_out / width)
+    share = torch.where(left_out <= _NOTHING, 0.0, left_out / (left_out + width))
     share = torch.where(known, share, torch.nan).nanmedian(1).values
-    return torch.nan_to_num(share, nan=torch.inf).amax(-1)
+    return torch.nan_to_num(share, nan=torch.inf).mean(-1)
 
 
 ORDERS = (2, 3)

@@ -113,12 +113,19 @@ def _second(out: Writer, program: Program, state: int, along: int) -> int:
 
 
 def expansion(loop: SampledLoop, division: Division) -> Expansion:
-    """The programs of a loop."""
-    n, m, s, h = loop.state_dim, loop.controls, division.substeps, loop.period / division.substeps
+    """The programs of a loop; the last ones are kept, as a proof comes back to them."""
     lagged, jitter = lagged_parts(loop.lag, loop.period, division), has_jitter(loop.lag)
+    return _expansion(loop.control, loop.rate, loop.period, division, lagged, jitter)
+
+
+@functools.lru_cache(maxsize=4)
+def _expansion(
+    control: Program, rate: Program, period: float, division: Division, lagged: int, jitter: bool
+) -> Expansion:
+    n, m, s, h = rate.states, rate.numbers, division.substeps, period / division.substeps
     lags = lagged > 0 or jitter
     before = 1 + 2 * n if jitter else 0
-    out = Writer(n + m if lags else n, before + 3 * n * s + 2 * lagged, loop.control.numbers)
+    out = Writer(n + m if lags else n, before + 3 * n * s + 2 * lagged, control.numbers)
     taken = 0
 
     def disturbed(count: int) -> int:
@@ -131,21 +138,21 @@ def expansion(loop: SampledLoop, division: Division) -> Expansion:
     if jitter:
         older, w, rest = disturbed(1), disturbed(n), disturbed(n)
         assert held is not None
-        back = out.of("mul", older, out.of("add", _rate(out, loop.rate, x, held), w))
+        back = out.of("mul", older, out.of("add", _rate(out, rate, x, held), w))
         measured = out.of("add", out.of("sub", x, back), rest)
     u = None
     inputs = {"state": measured} | ({} if out.numbers is None else {"numbers": out.numbers})
-    if loop.controls:
-        u = out.embedded(loop.control, inputs).control
+    if m:
+        u = out.embedded(control, inputs).control
     between, jumps = [], []
     for j in range(s):
         a, b, r = (disturbed(n) for _ in range(3))
         if j < lagged:
             assert held is not None and u is not None
             first, last = disturbed(1), disturbed(1)
-            jumps.append(out.of("sub", _rate(out, loop.rate, x, held), _rate(out, loop.rate, x, u)))
+            jumps.append(out.of("sub", _rate(out, rate, x, held), _rate(out, rate, x, u)))
             a, b = (out.of("add", w, out.of("mul", share, jumps[-1])) for w, share in ((a, first), (b, last)))
-        c = state_coefficients(out, loop.rate, x, u, a, division.order)
+        c = state_coefficients(out, rate, x, u, a, division.order)
         total: int | None = None
         for coefficient in c[:0:-1]:  # Horner's rule
             total = None if total is None else out.scaled(total, h)
@@ -164,10 +171,10 @@ def expansion(loop: SampledLoop, division: Division) -> Expansion:
     step = out.finished(next=after, control=out.join(*watched) if watched else None)
     return Expansion(
         step,
-        loop.rate,
-        _coefficients(loop.rate, division.order),
-        _tangent(loop.rate),
-        _change(loop.rate) if lagged else None,
+        rate,
+        _coefficients(rate, division.order),
+        _tangent(rate),
+        _change(rate) if lagged else None,
         lagged,
         jitter,
         division,

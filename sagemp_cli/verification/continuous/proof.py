@@ -2,7 +2,7 @@
 
 Cells whose proof fails are tried again. Where the remainders of the Taylor polynomials are a noticeable share of the
 tube, more parts a period are taken; else the cells are halved, each in the state whose halves are foreseen to miss
-least together.
+least together. Where a tube explodes before the end, what its first periods say decides both (:meth:`_Work.narrowed`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,17 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UsageError
+from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.any_loop import cells_of
-from sagemp_cli.reachability.continuous.division import ENOUGH, FINE, finer, remainder_share, suggested
+from sagemp_cli.reachability.continuous.division import (
+    ENOUGH,
+    FINE,
+    TRIED,
+    finer,
+    periods_lost,
+    remainder_share,
+    suggested,
+)
 from sagemp_cli.reachability.continuous.observed import ObservedOde
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
@@ -31,7 +40,7 @@ from sagemp_cli.sets import Box, Tube
 from sagemp_cli.sets.partition import halved
 from sagemp_cli.verification.continuous.attack import Found, Violation, search
 from sagemp_cli.verification.continuous.judging import Asked, Judgement, foreseen_missing, judged
-from sagemp_cli.verification.cutting import best_cut
+from sagemp_cli.verification.cutting import best_cut, cut_gains
 from sagemp_cli.verification.verdict import Answer
 
 LONGEST_NAME = 50
@@ -42,6 +51,13 @@ _PATIENCE = 3
 
 _GAIN = 0.02
 """A halving is in vain if what is missing falls by less than this share of it."""
+
+_WORTH = 0.05
+"""Of cells whose tubes explode: by how much, as the mean of logarithms, a change must narrow the tube of the first
+periods for the next one to be made before they are bounded again."""
+
+SYMBOLS = 100
+"""Generators that are kept for each state, where nobody says how many."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +73,11 @@ class Piece:
     cells: Box
     reach: Reach
     judgement: Judgement
+
+    @property
+    def bounded(self) -> bool:
+        """Whether all of its tubes are, up to the end."""
+        return bool(self.reach.tube.bounded.all())
 
     def of(self, index: Tensor) -> Piece:
         """The same for some of the cells."""
@@ -207,9 +228,7 @@ def verify_ode(
     for piece in pieces:
         seen.compare(piece.reach)
     verdicts = _verdicts(asked, pieces)
-    bounded = all(
-        bool(torch.isfinite(p.reach.tube.upper).all() & torch.isfinite(p.reach.tube.lower).all()) for p in pieces
-    )
+    bounded = all(p.bounded for p in pieces)
     if restarts and any(v.answer is not Answer.VERIFIED for v in verdicts):
         open_ones = [a for a, v in zip(asked, verdicts, strict=True) if v.answer is not Answer.VERIFIED]
         more = search(seen.loop, seen.start, seen.disturbance, open_ones, generator=generator, ascents=True)
@@ -262,6 +281,8 @@ class _Work:
         substeps: int | None,
         order: int | None,
     ) -> None:
+        if isinstance(propagator, Affine) and propagator.symbols is None:
+            propagator = replace(propagator, symbols=SYMBOLS * seen.loop.state_dim)
         self.loop, self.w, self.propagator, self.asked, self.at_once = (
             seen.loop,
             seen.disturbance,
@@ -283,15 +304,20 @@ class _Work:
             count = len(piece.cells.lower)
             if not count:
                 break
-            more = finer(division, **self.given) if refines and self.coarse(piece.reach) else None
+            room = budget - sum(len(p.cells.lower) for p in done)
+            if not piece.bounded and 2 * count <= room:
+                cells, better = self.narrowed(piece, division, room)
+                if better != division or len(cells.lower) > count:
+                    piece, division, refines = self.piece(cells, better, foresee=True), better, True
+                    continue
+            more = finer(division, **self.given) if refines and self.coarse(piece) else None
             if more is not None:
                 again = self.piece(piece.cells, more)
                 refines = float(again.judgement.missing.sum()) < (1 - _GAIN) * float(piece.judgement.missing.sum())
                 if refines:
                     piece, division = again, more
                     continue
-            settled = sum(len(p.cells.lower) for p in done)
-            if settled + 2 * count > budget or vain >= _PATIENCE:
+            if 2 * count > room or vain >= _PATIENCE:
                 break
             before = float(piece.judgement.missing.sum())
             halves = self.halved(piece, division)
@@ -301,23 +327,46 @@ class _Work:
             vain = vain + 1 if float(piece.judgement.missing.sum()) > 2 * (1 - _GAIN) * before else 0
         return [p for p in (*done, piece) if len(p.cells.lower)]
 
-    def coarse(self, reach: Reach) -> bool:
+    def narrowed(self, piece: Piece, division: Division, most: int) -> tuple[Box, Division]:
+        """Cells whose tubes explode, halved, each in the state in which that is foreseen to narrow the tube of the
+        first periods most, or their periods divided finer, if that does more; as long as it does a good deal. What
+        makes a tube explode is there from the beginning.
+        """
+        first, cells = self.loop.beginning(min(TRIED, self.loop.horizon)), piece.cells
+        share, more = float(remainder_share(piece.reach).mean()), finer(division, **self.given)
+        halvings, most_halvings = 0, 1 + round(2 * periods_lost(piece.reach) / self.loop.horizon)
+        while halvings < most_halvings and 2 * len(cells.lower) <= most:
+            reach = self.reach(first, cells, division, foresee=True)
+            assert reach.halves is not None
+            gains, states = cut_gains(cells, reach.tube, reach.halves).max(1)
+            gain = float(gains.mean())
+            # Remainders add up: a finer division would gain what they are on average over these periods.
+            if more is not None and (share * (first.horizon + 1) / 2 > gain or not bool(reach.tube.bounded.all())):
+                again = self.reach(first, cells, more, foresee=False)
+                if float((_log_widths(reach.tube) - _log_widths(again.tube)).mean()) > max(gain, _WORTH):
+                    division, more = more, None
+                    continue
+            if not gain > (_WORTH if halvings else 0.0):
+                break
+            cells, halvings, more = halved(cells, states), halvings + 1, None
+        return cells, division
+
+    def coarse(self, piece: Piece) -> bool:
         """Whether more parts would help: a tube that explodes does so for other reasons if remainders are small."""
-        bounded = bool(torch.isfinite(reach.tube.upper).all() & torch.isfinite(reach.tube.lower).all())
-        return bool((remainder_share(reach) > (FINE if bounded else ENOUGH)).any())
+        return bool((remainder_share(piece.reach) > (FINE if piece.bounded else ENOUGH)).any())
 
     def piece(self, cells: Box, division: Division, *, foresee: bool = False) -> Piece:
         """Cells bounded and judged."""
-        reach = self.reach(cells, division, foresee)
+        reach = self.reach(self.loop, cells, division, foresee=foresee)
         return Piece(cells, reach, judged(reach, self.asked, self.loop, self.w))
 
-    def reach(self, cells: Box, division: Division, foresee: bool) -> Reach:
-        """Cells bounded."""
+    def reach(self, loop: SampledLoop, cells: Box, division: Division, *, foresee: bool) -> Reach:
+        """Cells bounded, all periods or the first ones."""
         return _joined(
             [
                 reach_continuously(
                     self.propagator,
-                    self.loop,
+                    loop,
                     Box(low, high),
                     self.w,
                     substeps=division.substeps,
@@ -331,7 +380,7 @@ class _Work:
     def halved(self, piece: Piece, division: Division) -> Piece | None:
         """The halves of all cells, each in the state whose halves are foreseen to miss least; None if one cannot be."""
         reach = piece.reach  # the first cells were not asked what halving would do: most often they are enough
-        reach = self.reach(piece.cells, division, True) if reach.halves is None else reach
+        reach = self.reach(self.loop, piece.cells, division, foresee=True) if reach.halves is None else reach
         assert reach.halves is not None
 
         def missing(tube: Tube) -> Tensor:
@@ -339,6 +388,12 @@ class _Work:
 
         cut = best_cut(piece.cells, reach.tube, reach.halves, missing)
         return None if bool((cut < 0).any()) else self.piece(halved(piece.cells, cut), division, foresee=True)
+
+
+def _log_widths(tube: Tube) -> Tensor:
+    """Of each cell, the mean logarithm of the widths after the start; huge where one is infinite."""
+    width = torch.nan_to_num(tube.width[:, 1:], nan=1e300, posinf=1e300)
+    return width.clamp(1e-200, 1e300).log().mean((1, 2))
 
 
 def _joined(reaches: Sequence[Reach]) -> Reach:

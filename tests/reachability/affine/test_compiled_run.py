@@ -9,6 +9,7 @@ from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.affine.compiled.operations import Frame
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
+from sagemp_cli.reachability.program.loops import recorded
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.partition import partition
 from sagemp_cli.sets.zonotope import Zonotope
@@ -22,6 +23,16 @@ class Quotients:
     def step(self, k, x, w):
         a, b = x[..., 0], x[..., 1]
         return torch.stack([a / (2.0 + torch.cos(b)), b / (3.0 + a)], dim=-1) + 1.0 / (4.0 + w)
+
+
+class Weighted:
+    horizon, state_dim = 4, 2
+
+    def __init__(self, weight):
+        self.weight = weight
+
+    def step(self, k, x, w):
+        return torch.tanh(torch.nn.functional.linear(x, self.weight))
 
 
 class Angles:
@@ -131,3 +142,17 @@ def test_where_a_gradient_is_wanted_the_pass_is_on_tensors():
         tube = Affine().run(loop, Box(start.center - radius, start.center + radius), disturbance).tube
         tube.width[-1].sum().backward()
     assert bool((radius.grad > 0).all())
+
+
+def test_a_program_is_compiled_once_and_again_if_somebody_writes_into_its_constants():
+    loop, start, disturbance = LOOPS["quotients"]
+    weight = torch.tensor([[0.5, 0.1], [0.0, 0.5]], dtype=torch.float64)
+    known = recorded(Weighted(weight), start, disturbance)
+    with torch.no_grad():
+        before, again = (Affine().run(known, start, disturbance).tube for _ in range(2))
+        held = [c for p in known.programs for i in p.instructions for c in i.constants if c.shape == weight.shape]
+        for constant in held:
+            constant.mul_(0.5)
+        after = Affine().run(known, start, disturbance).tube
+    assert held and torch.equal(before.upper, again.upper)
+    assert float((after.width[-1] / before.width[-1]).amax()) < 0.5

@@ -141,6 +141,24 @@ def test_more_cells_are_taken_where_one_does_not_do():
     assert float(volume) == pytest.approx(float(wide.start.width.prod()))
 
 
+def explosive_rate(x, u):
+    return torch.stack([x[..., 1], x[..., 0] ** 2 + 2 * torch.sin(3 * x[..., 0]) + u[..., 0], 0.1 * x[..., 2]], -1)
+
+
+def explosive_control(x):
+    return torch.stack([-6 * torch.tanh(x[..., 0]) - 4 * torch.tanh(x[..., 1])], -1)
+
+
+def test_cells_of_a_tube_that_explodes_are_halved_in_states_that_it_comes_from():
+    start = box([-0.7, -0.7, 1.0], [0.7, 0.7, 2.0])
+    wide = seen(explosive_rate, explosive_control, start, period=0.2, horizon=8)
+    whole, few, enough = (verdict(observed=wide, restarts=0, budget=cells, substeps=1, order=2) for cells in (1, 2, 16))
+    assert not whole.bounded and not few.bounded and few.cells <= 2
+    assert enough.answer is Answer.VERIFIED and enough.bounded and 2 < enough.cells <= 16
+    widths = torch.cat([p.cells.width for p in enough.pieces])
+    assert bool((widths[:, 2] == 1.0).all())  # nothing hangs on the third state
+
+
 def test_nothing_that_is_not_a_number_proves_anything():
     observed = seen()
     asked = [Asked.of(Inside({"angle": (-5.0, 5.0)}).formula(NAMES), observed.loop, START.center)]

@@ -12,6 +12,7 @@ obeys the same recurrences with absolute values (:mod:`sagemp_cli.sets.rounding`
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -104,13 +105,11 @@ class Compiled:
         parts = [part for part in (self.outputs.control, self.outputs.deviation) if part is not None]
         return _joined(parts) if parts else None
 
-    def split(self, matrix: Tensor) -> tuple[Tensor, ...]:
-        """A combination's columns: of 1, numbers, states, disturbances, and each result that it may read."""
-        sizes = [1, self.numbers, self.states, self.disturbances]
-        for node in self.nodes:
-            if sum(sizes) < matrix.shape[-1]:
-                sizes.append(node.size)
-        return pad(matrix, (0, max(sum(sizes[:4]) - matrix.shape[-1], 0))).split(sizes, dim=-1)
+    @property
+    def columns(self) -> list[int]:
+        """Where the columns of 1, numbers, states, disturbances and each result begin, and where the last ones end."""
+        sizes = [1, self.numbers, self.states, self.disturbances, *(node.size for node in self.nodes)]
+        return [0, *itertools.accumulate(sizes)]
 
 
 def compiled(program: Program) -> Compiled:

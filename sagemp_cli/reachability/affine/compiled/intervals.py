@@ -14,7 +14,6 @@ Rounding: see :class:`_Fold`; the functions' ranges include theirs.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -48,8 +47,7 @@ class Intervals:
     """
 
     def __init__(self, step: Compiled, numbers: Tensor, disturbance: Box) -> None:
-        sizes = [1, step.numbers, step.states, step.disturbances, *(node.size for node in step.nodes)]
-        self.first = [0, *itertools.accumulate(sizes)]
+        self.first = step.columns
         self.nodes, self.numbers = step.nodes, numbers.detach().numpy()
         self.disturbance = tuple(side.detach().numpy() for side in (disturbance.lower, disturbance.upper))
         self.operands = [_Fold(node.operands) for node in step.nodes]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -198,20 +199,21 @@ class _Ready:
     """One program, compiled, with the numbers of all steps."""
 
     def __init__(self, program: Program, numbers: Tensor, disturbance: Box, *, tensors: bool) -> None:
-        step = compiled(program)
+        laid = _laid(program, tensors)
+        step = laid.step
         self._intervals = functools.cache(lambda: Intervals(step, numbers, disturbance))
         self.inputs = step.states + step.disturbances
         radius = disturbance.radius
         ones = radius.new_ones(*radius.shape[:-1], sum(node.size for node in step.nodes))
         self._own_radius = _placed(torch.cat([radius, ones], -1), tensors)
 
-        def fold(combination: Combination) -> _Fold:
-            return _Fold(step, combination, numbers, disturbance, tensors=tensors)
+        def fold(combination: _Laid) -> _Fold:
+            return _Fold(combination, numbers, disturbance, tensors=tensors)
 
-        self._nodes = [(node, fold(node.operands)) for node in step.nodes]
-        self._pairs = _pairs(step.nodes)
-        self._next = fold(step.outputs.next)
-        self._watched = None if step.watched is None else fold(step.watched)
+        self._nodes = [(node, fold(operands)) for node, operands in zip(step.nodes, laid.operands, strict=True)]
+        self._pairs = laid.pairs
+        self._next = fold(laid.next)
+        self._watched = None if laid.watched is None else fold(laid.watched)
 
     def radius_at(self, k: int) -> Array:
         """Radii of the variables of step k but the states, see :class:`.Frame`."""
@@ -328,45 +330,100 @@ def _pairs(nodes: Sequence[Node]) -> set[int]:
     }
 
 
+class _LaidStep(NamedTuple):
+    """A compiled step, all of it that is the same whatever its numbers and disturbance are."""
+
+    step: Compiled
+    operands: list[_Laid]
+    pairs: set[int]
+    next: _Laid
+    watched: _Laid | None
+
+
+_LAID: weakref.WeakKeyDictionary[Program, tuple[tuple[int, ...], _LaidStep]] = weakref.WeakKeyDictionary()
+"""Of programs that are there; each with the versions of its constants, which change if somebody writes into them."""
+
+
+def _laid(program: Program, tensors: bool) -> _LaidStep:
+    """A program's step, compiled once as long as it is there; each time anew where it is differentiated."""
+    constants = [c for i in program.instructions for c in i.constants]
+    versions = tuple(-1 if c.is_inference() else c._version for c in constants)
+    known = _LAID.get(program)
+    if known is not None and known[0] == versions and not tensors:
+        return known[1]
+    step = compiled(program)
+    first = step.columns
+
+    def laid(combination: Combination) -> _Laid:
+        return _Laid(first, combination, tensors=tensors)
+
+    operands = [laid(node.operands) for node in step.nodes]
+    watched = None if step.watched is None else laid(step.watched)
+    found = _LaidStep(step, operands, _pairs(step.nodes), laid(step.outputs.next), watched)
+    if not tensors and not any(c.requires_grad for c in constants):
+        _LAID[program] = versions, found
+    return found
+
+
+class _Laid:
+    """A combination by what it is of: 1, the step's numbers, states, disturbances, and each result.
+
+    Attributes:
+        of_one, of_numbers, of_disturbance: matrix and sizes ``(2, rows, columns)``; None if nothing is of them.
+        of_state, of_results: transposed, as they are used; of results by their index, the latest first.
+        direct: coefficients of state and disturbance.
+        error: relative.
+    """
+
+    def __init__(self, first: Sequence[int], combination: Combination, *, tensors: bool) -> None:
+        missing = max(first[4] - combination.matrix.shape[-1], 0)
+        sides = [torch.nn.functional.pad(side, (0, missing)) if missing else side for side in combination[:2]]
+        some = (sides[1].detach() != 0).any(0).numpy()
+        before = np.concatenate([[0], np.cumsum(some)])
+        blocks = itertools.takewhile(lambda block: block[1] < len(before), itertools.pairwise(first))
+        used = [(i, a, b) for i, (a, b) in enumerate(blocks) if before[b] > before[a]]
+        inputs = {i: torch.stack([side[:, a:b] for side in sides]) for i, a, b in used if i < 4}
+        self.of_one = torch.stack([side[:, 0] for side in sides])
+        self.of_numbers, self.of_disturbance = inputs.get(1), inputs.get(3)
+        self.of_state = _placed(inputs[2].mT.contiguous(), tensors) if 2 in inputs else None
+        self.of_results = [
+            (
+                i - 4,
+                _placed(sides[0][:, a:b].contiguous(), tensors),
+                _placed(torch.stack([side[:, a:b].mT for side in sides]).contiguous(), tensors),
+            )
+            for i, a, b in reversed(used)
+            if i > 3
+        ]
+        self.direct: Any = None
+        if 3 in inputs:
+            self.direct = _placed(sides[0][:, first[2] : first[4]].contiguous()[None], tensors)
+        elif 2 in inputs or not self.of_results:
+            self.direct = _placed(sides[0][:, first[2] : first[3]].contiguous()[None], tensors)
+        self.error = combination.error + combined(sum(b - a for _, a, b in used))
+
+
 class _Fold:
     """A combination, ready for one propagation: what the step's numbers and the disturbance's centre contribute to the
     constants is known for all steps.
     """
 
-    def __init__(
-        self, step: Compiled, combination: Combination, numbers: Tensor, disturbance: Box, *, tensors: bool
-    ) -> None:
+    def __init__(self, laid: _Laid, numbers: Tensor, disturbance: Box, *, tensors: bool) -> None:
         linear = torch.nn.functional.linear
-        matrix, sizes = (step.split(side) for side in combination[:2])
-        used = [bool(part.any()) for part in sizes]
-        w = disturbance.center
-        constant = matrix[0][:, 0] + linear(w, matrix[3])
-        size = sizes[0][:, 0] + linear(w.abs() + disturbance.radius + TINY, sizes[3]) + TINY
-        self._varies = used[1] or (used[3] and w.dim() > 1)
-        if not self._varies and w.dim() > 1:
-            constant, size = constant[0, 0], size[0, 0]
-        if used[1]:
-            constant, size = constant + linear(numbers, matrix[1]), size + linear(numbers.abs(), sizes[1])
-        if self._varies:
-            self._constant = _placed(torch.stack([constant, size], dim=1), tensors)
-        else:
-            self._constant = _placed(torch.stack([constant, size])[:, None], tensors)
-
-        def sided(i: int) -> Array:
-            return _placed(torch.stack([matrix[i].mT, sizes[i].mT]).contiguous(), tensors)
-
-        self._of_state = sided(2) if used[2] else None
-        self._of_results = [
-            (i - 4, _placed(matrix[i].contiguous(), tensors), sided(i)) for i in range(len(used) - 1, 3, -1) if used[i]
-        ]
-        # Coefficients of state and disturbance; results are taken the latest first, which has most variables.
-        self._direct: Any = None
-        if used[3]:
-            self._direct = _placed(torch.cat([matrix[2], matrix[3]], dim=-1)[None], tensors)
-        elif used[2] or not self._of_results:
-            self._direct = _placed(matrix[2].contiguous()[None], tensors)
-        length = sum(part.shape[-1] for part, some in zip(matrix, used, strict=True) if some)
-        self._error = combination.error + combined(length)
+        constant, size = laid.of_one
+        size = size + TINY
+        if laid.of_disturbance is not None:
+            w, (matrix, sizes) = disturbance.center, laid.of_disturbance
+            constant = constant + linear(w, matrix)
+            size = size + linear(w.abs() + disturbance.radius + TINY, sizes)
+        if laid.of_numbers is not None:
+            matrix, sizes = laid.of_numbers
+            constant, size = constant + linear(numbers, matrix), size + linear(numbers.abs(), sizes)
+        self._varies = constant.dim() > 1
+        stacked = torch.stack([constant, size], dim=1) if self._varies else torch.stack([constant, size])[:, None]
+        self._constant = _placed(stacked, tensors)
+        self._of_state, self._of_results, self._direct = laid.of_state, laid.of_results, laid.direct
+        self._error = laid.error
 
     def __call__(self, k: int, frame: Frame, results: Sequence[Value]) -> Value:
         """The combination at step k."""
