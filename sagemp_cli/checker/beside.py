@@ -14,7 +14,18 @@ from sagemp_cli.checker.balls import arb, arb_mat
 from sagemp_cli.checker.points import Point
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
 from sagemp_cli.checker.ranges import Range, values
-from sagemp_cli.checker.rows import ZERO, Row, Rows, column, combined, keeps_linear, repeated, subtracted, weights_of
+from sagemp_cli.checker.rows import (
+    ZERO,
+    Row,
+    Rows,
+    column,
+    combined,
+    keeps_linear,
+    repeated,
+    subtracted,
+    transformed,
+    weights_of,
+)
 
 ONE = arb(1)
 
@@ -30,7 +41,7 @@ class Combinations:
         columns: basic values.
         first: of each nonlinear slot, the first of its own.
         operands: of each nonlinear slot, its operands, equally long; of two that are compared, or that are chosen from,
-            also their difference.
+            also their difference; of sums in float32 the exact sums and what is summed.
         outputs: of the slots that are outputs.
     """
 
@@ -47,7 +58,11 @@ class Combinations:
             elif keeps_linear(program, slot):
                 rows[slot] = self._linear(program, instruction, [rows[r] for r in instruction.reads])
             else:
-                read = repeated([rows[r] for r in instruction.reads])
+                read = [rows[r] for r in instruction.reads]
+                if instruction.kind == "float32_linear":  # the exact sums, and what is summed
+                    read = [transformed(weights_of(instruction, len(read[0])), read[0]), *read]
+                else:
+                    read = repeated(read)
                 if instruction.kind in ("maximum", "minimum", "where"):
                     read.append([subtracted(a, b) for a, b in zip(*read[-2:], strict=True)])
                 self.operands[slot] = [_Combination(part) for part in read]
@@ -82,12 +97,13 @@ class Beside:
         self._ends: list[Range] = [(ONE, ONE), *inputs, *[None] * (program.columns - 1 - len(inputs))]
 
     def operands(self, slot: int) -> list[list[Range]]:
-        """Of the operands of a nonlinear slot, equally long, and of the difference of two that are compared."""
+        """Of the operands of a nonlinear slot, as :class:`Combinations` has them."""
         return [combination.of(self._ends) for combination in self._of.operands[slot]]
 
     def know(self, slot: int, instruction: Instruction, operands: Sequence[Sequence[Range]]) -> None:
         """The result of a nonlinear slot, from intervals of its operands."""
-        found = values(instruction, operands[: len(instruction.reads)])
+        read = len(operands) if instruction.kind == "float32_linear" else len(instruction.reads)
+        found = values(instruction, operands[:read])
         first = self._of.first[slot]
         self._ends[first : first + len(found)] = found
 

@@ -23,11 +23,15 @@ from sagemp_cli.checker.equations import (
 )
 from sagemp_cli.checker.lag import Lag
 from sagemp_cli.checker.ode import Flow
-from sagemp_cli.checker.program import Program
+from sagemp_cli.checker.program import FLOAT32, MATRICES, Program
 from sagemp_cli.checker.requirement import Required
 
 _NETWORK = 8  # rows and columns from which on a matrix is called a network's
 _MOST_REFERENCES = 12
+_ARITHMETIC = (
+    "float32 where the equations say float32: IEEE rounding, sums in any order, functions to 8 units in the last place "
+    "(docs/program.md); real elsewhere"
+)
 _MOST_EQUATIONS, _LONGEST_EQUATION = 24, 160  # of an ODE that is printed in full
 
 
@@ -52,6 +56,8 @@ def claim_rows(document: Document) -> list[tuple[str, str]]:
         *([("w enters", text) for text in [_entrance(document)] if text] if document.ode is None else []),
         *(_models(document) if document.ode is None else _ode(document, document.ode)),
     ]
+    if any(i.kind in FLOAT32 for program in document.programs for i in program.instructions):
+        rows.append(("arithmetic", _ARITHMETIC))
     tubes = document.tubes
     safe_ones = [r for r, v in enumerate(tubes["verdict"]) if v == "SAFE"] or list(range(len(tubes["verdict"])))
     rows.append(("proves", _aims(document)))
@@ -329,12 +335,12 @@ def _chain(program: Program, slots: Sequence[int]) -> str:
     for slot in slots:
         instruction, width = program.instructions[slot], program.widths[slot]
         constants += len(instruction.constants)
-        if instruction.kind == "linear":
+        if instruction.kind in MATRICES:
             columns = program.widths[instruction.reads[0]]
             large = min(width, columns) > 1 and max(width, columns) >= _NETWORK
             network |= large
             words += [f"{width} x {columns}"] if large else []
-        else:
+        elif instruction.kind not in FLOAT32:
             words += [name for name, _ in program.relaxed[slot]]
     counted: list[list[Any]] = []
     for word in words:

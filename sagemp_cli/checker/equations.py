@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sagemp_cli.checker.program import PAIRS, Instruction, Program
+from sagemp_cli.checker.program import MATRICES, PAIRS, Instruction, Program
 
 _SMALL = 24  # entries of a vector that are shown one by one
 _MATRIX = 64  # numbers of a matrix that are shown one by one
@@ -154,7 +154,7 @@ class _Writer:
         if kind == "numbers":
             return "ref" if width != 1 else ["ref"]
         operands = [self.texts[r] for r in instruction.reads]
-        large = kind == "linear" and len(instruction.constants) > _MATRIX
+        large = kind in MATRICES and len(instruction.constants) > _MATRIX
         if kind == "constant" and (width > _SMALL or len(set(instruction.constants.tolist())) == 1 < width):
             values = [_number(c) for c in instruction.constants]
             return values[0] if len(set(values)) == 1 else self._vector(slot, f"({_few(values)})")
@@ -179,10 +179,11 @@ class _Writer:
             return [operands[0][i] for i in instruction.entries]
         if kind == "join":
             return [t for o in operands for t in o]
-        if kind == "linear":
+        if kind in MATRICES:
             matrix, bias = matrix_of(instruction, len(operands[0]))
-            return [_sum([_times(_number(w), t) for w, t in zip(row, operands[0], strict=True) if w], b)
+            sums = [_sum([_times(_number(w), t) for w, t in zip(row, operands[0], strict=True) if w], b)
                     for row, b in zip(matrix, bias, strict=True)]  # fmt: skip
+            return sums if kind == "linear" else [f"float32({text})" for text in sums]
         if kind in PAIRS:
             a, b = (list(o) * (width if len(o) == 1 else 1) for o in operands)
             return [_pair(kind, x, y) for x, y in zip(a, b, strict=True)]
@@ -213,12 +214,14 @@ class _Writer:
             return f"{whole[0]}[{_few([str(i) for i in instruction.entries])}]"
         if kind == "join":
             return f"({', '.join(_few(o) if isinstance(o, list) else o for o in operands)})"
-        if kind == "linear":
+        if kind in MATRICES:
             columns = self.program.widths[instruction.reads[0]]
             matrix, bias = matrix_of(instruction, columns)
             size = f"{matrix.shape[0]} x {matrix.shape[1]}"
             shift = f" + b{slot}" if bias.any() else ""
-            return f"M{slot} {whole[0]}{shift}, M{slot} {size} up to {np.abs(matrix).max():.3g}"
+            product = f"M{slot} {whole[0]}{shift}"
+            product = product if kind == "linear" else f"float32({product})"
+            return f"{product}, M{slot} {size} up to {np.abs(matrix).max():.3g}"
         if kind in _SIGNS:
             return f" {_SIGNS[kind]} ".join(whole)
         constants = [_number(c) for c in instruction.constants]

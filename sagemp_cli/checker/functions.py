@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from sagemp_cli.checker.balls import Unproved, arb, ball
+from sagemp_cli.checker.float32 import ROUNDINGS, Rounding
 from sagemp_cli.checker.jumps import JUMPS, Sawtooth, Staircase, fmod, remainder
 
 _MOST_SPLITS = 4096
@@ -332,10 +333,12 @@ def clamp(low: float, high: float) -> Function:
     return Function(tuple(pieces))
 
 
-def function_of(kind: str, constants: Sequence[float]) -> Function | Staircase | Sawtooth:
-    """The function of an instruction that has one operand and is not linear."""
+def function_of(kind: str, constants: Sequence[float]) -> Function | Staircase | Sawtooth | Rounding:
+    """The function of an instruction that has one operand and is not linear; of float32 what is known of it."""
     if kind in JUMPS:
         return JUMPS[kind]
+    if kind in ROUNDINGS:
+        return ROUNDINGS[kind]
     made = _WITH_NUMBERS.get(kind)
     return FUNCTIONS[kind] if made is None else made(*constants)
 

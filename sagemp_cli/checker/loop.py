@@ -14,7 +14,7 @@ import numpy as np
 from sagemp_cli.checker.balls import arb, arb_mat, balls
 from sagemp_cli.checker.beside import Combinations
 from sagemp_cli.checker.points import Point, value_of
-from sagemp_cli.checker.program import INPUTS, Program
+from sagemp_cli.checker.program import INPUTS, MATRICES, Program
 from sagemp_cli.checker.rows import ZERO, Rows, Weights, column, combined, joined, keeps_linear, weights_of
 
 ONE = arb(1)
@@ -60,7 +60,7 @@ class Folded:
             elif instruction.kind in INPUTS:
                 linear[slot] = _input(program, instruction.kind)
             else:
-                if instruction.kind == "linear":
+                if instruction.kind in MATRICES:
                     weights[slot] = weights_of(instruction, program.widths[reads[0]])
                 if keeps_linear(program, slot) and all(r in linear or r in constants for r in reads):
                     operands = [linear[r] if r in linear else column(constants[r]) for r in reads]

@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from sagemp_cli.checker.balls import arb, balls
+from sagemp_cli.checker.float32 import Rounding, of_sums
 from sagemp_cli.checker.functions import Function, clamp, function_of
 from sagemp_cli.checker.jumps import Sawtooth, Staircase
-from sagemp_cli.checker.program import INPUTS, Instruction, Program
+from sagemp_cli.checker.program import INPUTS, MATRICES, Instruction, Program
 
 Point = list[arb]
 
@@ -40,8 +41,9 @@ def value_of(instruction: Instruction, operands: Sequence[Point]) -> Point:
         return [operands[0][i] for i in instruction.entries]
     if kind == "join":
         return [entry for operand in operands for entry in operand]
-    if kind == "linear":
-        return _linear(constants, operands[0])
+    if kind in MATRICES:
+        exact = _linear(constants, operands[0])
+        return exact if kind == "linear" else _in_float32(constants, operands[0], exact)
     if kind in _PAIRS:
         width = max(map(len, operands))
         pairs = zip(*(list(o) * (width if len(o) == 1 else 1) for o in operands), strict=True)
@@ -55,7 +57,7 @@ def value_of(instruction: Instruction, operands: Sequence[Point]) -> Point:
     return [f.value(a) for f, a in zip(functions_of(instruction, len(operands[0])), operands[0], strict=True)]
 
 
-def functions_of(instruction: Instruction, width: int) -> list[Function | Staircase | Sawtooth]:
+def functions_of(instruction: Instruction, width: int) -> list[Function | Staircase | Sawtooth | Rounding]:
     """The function of each entry of an instruction that has one operand and is not linear."""
     constants = instruction.constants.tolist()
     if instruction.kind == "clamp":
@@ -71,6 +73,12 @@ def _linear(constants: np.ndarray, operand: Point) -> Point:
         sum((w * a for w, a in zip(weights[i * columns : (i + 1) * columns], operand, strict=True)), start=bias[i])
         for i in range(rows)
     ]
+
+
+def _in_float32(constants: np.ndarray, operand: Point, exact: Point) -> Point:
+    """All that float32 arithmetic may give for these sums."""
+    most = _linear(abs(constants), [abs(a).upper() for a in operand])
+    return [a + arb(0, of_sums(size.upper(), len(operand))) for a, size in zip(exact, most, strict=True)]
 
 
 _PAIRS: Mapping[str, Callable[[arb, arb], arb]] = {

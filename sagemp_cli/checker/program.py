@@ -24,7 +24,10 @@ WITH_NUMBERS: Mapping[str, int] = {"leaky_relu": 1, "elu": 1, "softplus": 2, "po
 """Functions of one value that have constants, and how many."""
 PAIRS = ("add", "sub", "mul", "div", "maximum", "minimum", "atan2")
 TRIPLES = ("where",)
-UNARY = ("pick", "linear", "neg", "clamp", "identity", *SCALARS, *WITH_NUMBERS)
+FLOAT32 = ("float32", "float32_near", "float32_linear")
+"""What stands for float32 arithmetic; docs/program.md says what it may give."""
+MATRICES = ("linear", "float32_linear")
+UNARY = ("pick", *MATRICES, "float32", "float32_near", "neg", "clamp", "identity", *SCALARS, *WITH_NUMBERS)
 
 KINDS = (*INPUTS, "constant", "join", *UNARY, *PAIRS, *TRIPLES)
 """All kinds of instructions."""
@@ -218,7 +221,7 @@ def _width(instruction: Instruction, read: Sequence[int], sizes: Mapping[str, in
         raise ValueError("its constants must be finite")
     if kind == "constant":
         width = count
-    elif kind == "linear":
+    elif kind in MATRICES:
         width, left = divmod(count, read[0] + 1)
         if left:
             raise ValueError(f"{count} constants are no matrix and bias of an operand of {read[0]} entries")

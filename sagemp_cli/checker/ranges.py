@@ -9,8 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from sagemp_cli.checker.balls import arb, ball
+from sagemp_cli.checker.float32 import of_sums, sizes
 from sagemp_cli.checker.functions import function_of
 from sagemp_cli.checker.program import Instruction
+from sagemp_cli.checker.rows import weights_of
 from sagemp_cli.checker.unproved import Unproved
 
 Range = tuple[arb, arb] | None
@@ -20,8 +22,12 @@ _ZERO = arb(0)
 
 
 def values(instruction: Instruction, operands: Sequence[Sequence[Range]]) -> list[Range]:
-    """Of a nonlinear instruction, from those of its operands, which are equally long."""
+    """Of a nonlinear instruction, from those of its operands, which are equally long; of sums in float32 from the exact
+    sums and what is summed.
+    """
     kind = instruction.kind
+    if kind == "float32_linear":
+        return _sums(instruction, *operands)
     if kind == "where":
         return [_outwards(_chosen(*entry)) for entry in zip(*operands, strict=True)]
     if kind in _PAIRS:
@@ -51,6 +57,15 @@ def _chosen(c: Range, a: Range, b: Range) -> Range:
     if c is not None and (c[0] > 0 or c[1] <= 0):
         return a if c[0] > 0 else b
     return None if a is None or b is None else (a[0].min(b[0]), a[1].max(b[1]))
+
+
+def _sums(instruction: Instruction, exact: Sequence[Range], terms: Sequence[Range]) -> list[Range]:
+    ends = [a for a in terms if a is not None]
+    if len(ends) < len(terms):
+        return [None] * len(exact)
+    matrix, bias = weights_of(instruction, len(terms))
+    errors = [of_sums(size, len(terms)) for size in sizes(matrix, bias, ends)]
+    return [None if a is None else _outwards((a[0] - e, a[1] + e)) for a, e in zip(exact, errors, strict=True)]
 
 
 def _of_one(instruction: Instruction, i: int, a: Range) -> Range:

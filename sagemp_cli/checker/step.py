@@ -10,12 +10,14 @@ is never trusted.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import repeat
 from typing import NamedTuple
 
 from sagemp_cli.checker.angle import Turned, angle_excess
 from sagemp_cli.checker.balls import arb, arb_mat, ball
 from sagemp_cli.checker.beside import Beside
+from sagemp_cli.checker.float32 import around, of_sums, sizes
 from sagemp_cli.checker.functions import FUNCTIONS
 from sagemp_cli.checker.loop import Loop
 from sagemp_cli.checker.points import functions_of
@@ -25,6 +27,7 @@ from sagemp_cli.checker.rows import (
     ZERO,
     Row,
     Rows,
+    Weights,
     added,
     column,
     combined,
@@ -33,6 +36,7 @@ from sagemp_cli.checker.rows import (
     repeated,
     subtracted,
     times,
+    transformed,
 )
 from sagemp_cli.checker.unproved import Unproved
 from sagemp_cli.checker.zonotope import Zonotope
@@ -143,6 +147,8 @@ class Step:
         elif kind == "where":
             condition, left, right = repeated(operands)
             rows = self._choice(condition, left, right, within)
+        elif kind == "float32_linear":
+            rows = self._sums(folded.weights[slot], operands[0], within)
         else:
             functions = functions_of(instruction, len(operands[0]))
             rows = self._relaxed(kind, operands[0], [f.excess for f in functions], within[0])
@@ -160,6 +166,13 @@ class Step:
             self._put(name, times(row, slope), bounds, entry)
             for row, slope, bounds, entry in zip(rows, slopes, found, entries, strict=True)
         ]
+
+    def _sums(self, weights: Weights, rows: Rows, within: Sequence[list[Range]]) -> Rows:
+        """Sums of products in float32: the exact ones, and an error that the sizes of what is summed bound."""
+        ends = _within(self.bounds(rows), within[1])
+        within[1][:] = ends
+        functions = [partial(_around, of_sums(size, len(rows))) for size in sizes(*weights, ends)]
+        return self._relaxed("float32_linear", transformed(weights, rows), functions, within[0])
 
     def _product(self, left: Rows, right: Rows, within: Sequence[list[Range]] | None) -> Rows:
         """Product of values whose deviations X and Y may be correlated: ``X Y = (P^2 - M^2) / 4`` with
@@ -309,6 +322,10 @@ class Step:
         row.append(radius)
         self._next += 1
         return row
+
+
+def _around(error: arb, slope: arb, lower: arb, upper: arb) -> tuple[arb, arb]:
+    return around(slope, lower, upper, error)
 
 
 def _within(bounds: Sequence[Bounds], known: Sequence[Range]) -> list[Bounds]:

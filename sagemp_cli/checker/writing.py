@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sagemp_cli.checker.program import INPUTS, Instruction, Program
+from sagemp_cli.checker.program import INPUTS, MATRICES, Instruction, Program
 
 _MOST_LINES = 40_000
 """More than a program may keep; one that is longer while it is written is given up."""
@@ -55,7 +55,7 @@ class Writer:
             width = len(entries)
         elif kind == "join":
             width = sum(widths)
-        elif kind == "linear":
+        elif kind in MATRICES:
             width = len(given) // (widths[0] + 1)
         return self._line(kind, tuple(reads), given, tuple(entries), width)
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor, nn
+
+from sagemp_cli.errors import ConfigError
+
+Precision = Literal["real", "float32"]
+"""How a network is taken: as the real function of its numbers, or as float32 arithmetic evaluates it."""
 
 
 class Controller(nn.Module, ABC):
@@ -63,6 +68,30 @@ class Controller(nn.Module, ABC):
         """What no control leaves in real arithmetic, ``(m,)`` each; infinite if nothing is known."""
         everywhere = torch.full((self.control_dim,), torch.inf, dtype=torch.float64)
         return -everywhere, everywhere
+
+
+def check_precision(precision: str) -> None:
+    """Refuse what is none of :data:`Precision`."""
+    if precision not in get_args(Precision):
+        raise ConfigError(f"tracker.precision must be one of {', '.join(get_args(Precision))}, found {precision!r}")
+
+
+def rounded_range(scale: Tensor, offset: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """What ``h scale + offset`` does not leave in float32 arithmetic, for h in ``[-reach, reach]``; ``(m,)`` each.
+
+    Both constants, the product and the sum are rounded once each, by at most ``2^-24`` of what it is.
+    """
+    size = scale.abs() * reach * (1 + 2.0**-22) + offset.abs() * 2.0**-22 + 2.0**-120
+    return offset - size, offset + size
+
+
+def scaled_in_float32(h: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+    """``h scale + offset`` in float32, as float64; a factor of 1 and a term of 0, which change nothing, left out."""
+    if not bool((scale == 1).all()):
+        h = h * scale.float()
+    if not bool((offset == 0).all()):
+        h = h + offset.float()
+    return h.double()
 
 
 def lookahead_errors(window: Tensor, x: Tensor) -> Tensor:

@@ -7,7 +7,14 @@ from torch import Tensor, nn
 
 from sagemp_cli.config.ranges import Count, Decay, Widths
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.loop.controller import Controller, lookahead_errors
+from sagemp_cli.loop.controller import (
+    Controller,
+    Precision,
+    check_precision,
+    lookahead_errors,
+    rounded_range,
+    scaled_in_float32,
+)
 
 
 class Tracker(Controller):
@@ -20,6 +27,9 @@ class Tracker(Controller):
     The paper penalises control limits in training only. With ``saturate`` the network's output is cut off at +-1, so
     that every control lies within ``control_offset +- control_scale``, whatever the error: what is proved then needs
     no actuator that does more.
+
+    With ``precision`` float32 the errors are rounded to float32, and all that follows is float32 arithmetic on weights
+    and scales that are rounded to float32 as well: what ``export --float32`` writes. Proofs then hold for that.
     """
 
     error_scale: Tensor
@@ -38,6 +48,7 @@ class Tracker(Controller):
         control_scale: list[float] | None = None,
         control_offset: list[float] | None = None,
         saturate: bool = False,
+        precision: Precision = "real",
     ) -> None:
         super().__init__()
         if lookahead < 1 or not hidden or min(hidden) < 1:
@@ -46,7 +57,8 @@ class Tracker(Controller):
             raise ConfigError(f"tracker: negative_slope must lie in [0, 1), found {negative_slope}")
         if not isinstance(saturate, bool):
             raise ConfigError(f"tracker: saturate must be true or false, found {saturate!r}")
-        self.saturate = saturate
+        check_precision(precision)
+        self.saturate, self.precision = saturate, precision
         self.state_dim, self.control_dim, self.lookahead = state_dim, control_dim, lookahead
         self.hidden, self.negative_slope = list(hidden), float(negative_slope)
         for key, values, size, default in (
@@ -76,6 +88,8 @@ class Tracker(Controller):
 
     def forward(self, errors: Tensor) -> Tensor:
         """Controls ``(..., m)`` from lookahead errors (or other features) ``(..., N, n)``."""
+        if self.precision == "float32":
+            return self._in_float32(errors)
         h = self.layers[0]((errors * self.error_scale).flatten(-2))
         for layer in self.layers[1:]:
             h = layer(nn.functional.leaky_relu(h, self.negative_slope))
@@ -83,8 +97,25 @@ class Tracker(Controller):
             h = h.clamp(-1.0, 1.0)
         return h * self.control_scale + self.control_offset
 
+    def _in_float32(self, errors: Tensor) -> Tensor:
+        """The same operations but for those that change nothing, on numbers that are rounded to float32."""
+        h = errors.float()
+        if not bool((self.error_scale == 1).all()):
+            h = h * self.error_scale.float()
+        h = h.flatten(-2)
+        for i, layer in enumerate(self.layers):
+            assert isinstance(layer, nn.Linear)
+            if i:
+                h = nn.functional.leaky_relu(h, self.negative_slope)
+            h = nn.functional.linear(h, layer.weight.float(), layer.bias.float())
+        if self.saturate:
+            h = h.clamp(-1.0, 1.0)
+        return scaled_in_float32(h, self.control_scale, self.control_offset)
+
     def control_range(self) -> tuple[Tensor, Tensor]:
-        """What no control leaves in real arithmetic, ``(m,)`` each, rounded outwards; infinite unless it saturates."""
+        """What no control leaves, ``(m,)`` each, rounded outwards; infinite unless it saturates."""
+        if self.saturate and self.precision == "float32":
+            return rounded_range(self.control_scale, self.control_offset, 1.0)
         reach = self.control_scale.abs() if self.saturate else torch.full_like(self.control_scale, torch.inf)
         return _outwards(self.control_offset, -reach), _outwards(self.control_offset, reach)
 

@@ -30,6 +30,7 @@ OF_ONE: dict[str, Callable] = {
     "hardswish": torch.nn.functional.hardswish, "floor": torch.floor, "ceil": torch.ceil, "round": torch.round,
     "trunc": torch.trunc, "sign": torch.sign, "positive": lambda a: (a > 0).double(),
     "wrap": lambda a: torch.atan2(a.sin(), a.cos()),
+    "float32": lambda a: a.float().double(), "float32_near": lambda a: a.float().double(),
 }  # fmt: skip
 OF_TWO: dict[str, Callable] = {
     "add": torch.add, "sub": torch.sub, "mul": torch.mul, "div": torch.div, "maximum": torch.maximum,
@@ -53,11 +54,12 @@ def run(made: Program, x: np.ndarray, w: np.ndarray, numbers: np.ndarray | None 
             value = read[0][:, torch.from_numpy(instruction.entries)]
         elif kind == "join":
             value = torch.cat([r.expand(len(x), -1) for r in read], -1)
-        elif kind == "linear":
+        elif kind in ("linear", "float32_linear"):
             columns = read[0].shape[1]
             rows = len(constants) // (columns + 1)
             matrix, bias = constants[: rows * columns].reshape(rows, columns), constants[rows * columns :]
             value = read[0] @ matrix.T + bias
+            value = value if kind == "linear" else value.float().double()
         elif kind in OF_TWO:
             value = OF_TWO[kind](*read)
         elif kind in OF_ONE:

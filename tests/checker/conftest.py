@@ -107,6 +107,7 @@ def make_case(
     side=0.0,
     disc=None,
     limit=None,
+    precision="real",
     time="discrete",
     order=None,
     lag=None,
@@ -125,6 +126,7 @@ def make_case(
     hover = {"planar_quadrotor": [0.5 * 9.81, 0.0], "quadrotor": [9.81, 0.0, 0.0, 0.0]}.get(robot, [0.0] * m)
     arguments = {"state_dim": n, "control_dim": m, "lookahead": 3, "hidden": list(hidden), "negative_slope": 0.1}
     arguments |= {"control_offset": hover, "control_scale": [0.5 if robot == "unicycle" else 0.05] * m}
+    arguments["precision"] = precision
     if limit is not None:
         arguments |= {"saturate": True, "control_scale": [limit] * m, "error_scale": [60.0] * n}
     with torch.random.fork_rng(devices=[]):

@@ -92,7 +92,7 @@ class Layer:
 
 
 class Network(nn.Module):
-    """Layers one after the other, in float64; the last one's result is the output.
+    """Layers one after the other; the last one's result is the output. The arithmetic is that of the input's type.
 
     Args:
         inputs: entries of the input.
@@ -130,18 +130,31 @@ class Network(nn.Module):
         """A constant of layer i: ``weight`` and ``bias``, or ``value``."""
         return getattr(self, f"layer{i}_{name}")
 
+    def _of_type(self, i: int, name: str, kind: torch.dtype) -> Tensor:
+        value = self.constant(i, name)
+        if kind is value.dtype:
+            return value
+        found = value.to(kind)
+        if not torch.equal(found.to(value.dtype), value):
+            raise ConfigError(
+                f"network: {name} of layer {i} has numbers that are not of float32, as a float64 file has or a 'Gemm' "
+                f"with a factor; it cannot be evaluated in float32"
+            )
+        return found
+
     def forward(self, x: Any) -> Any:
         """Outputs ``(..., outputs)`` from inputs ``(..., inputs)``."""
         values = [x]
         for i, layer in enumerate(self.layers, start=1):
-            values.append(self._layer(i, layer, [values[r] for r in layer.reads]))
+            values.append(self._layer(i, layer, [values[r] for r in layer.reads], x.dtype))
         return values[-1]
 
-    def _layer(self, i: int, layer: Layer, reads: Sequence[Any]) -> Any:
+    def _layer(self, i: int, layer: Layer, reads: Sequence[Any], kind: torch.dtype) -> Any:
         if layer.kind == "linear":
-            return nn.functional.linear(reads[0], self.constant(i, "weight"), self.constant(i, "bias"))
+            weight, bias = (self._of_type(i, name, kind) for name in ("weight", "bias"))
+            return nn.functional.linear(reads[0], weight, bias)
         if layer.kind == "constant":
-            return self.constant(i, "value")
+            return self._of_type(i, "value", kind)
         if layer.kind == "pick":
             return torch.index_select(reads[0], -1, torch.tensor(layer.entries))
         if layer.kind in OPERATORS:

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.loop.controller import Controller, lookahead_errors
+from sagemp_cli.loop.controller import (
+    Controller,
+    Precision,
+    check_precision,
+    lookahead_errors,
+    scaled_in_float32,
+)
 from sagemp_cli.loop.onnx_format.layers import Layer, Network
 from sagemp_cli.loop.onnx_format.lowering import read_network
 
@@ -24,7 +30,8 @@ class OnnxTracker(Controller):
     """``u = control_scale * network(input) + control_offset``, the network's weights taken as the numbers stored.
 
     Of its own arithmetic an ONNX file says float32; here the network is the real function with these weights, evaluated
-    in float64 (:mod:`sagemp_cli.loop.onnx_format.lowering`).
+    in float64 (:mod:`sagemp_cli.loop.onnx_format.lowering`), unless ``precision`` is float32: then the input is rounded
+    to float32 and network, scale and offset are evaluated in float32 arithmetic.
 
     Args:
         state_dim, control_dim: of the robot.
@@ -33,6 +40,7 @@ class OnnxTracker(Controller):
             (``errors``), the state ``x`` (``state``), or the state and after it ``p_{k+1}, ..., p_{k+N}``
             (``state_and_reference``). N follows from the size of the network's input.
         control_scale, control_offset: m numbers each; 1 and 0 if not given.
+        precision: see above.
         network: its layers as plain data, as an artifact has them.
     """
 
@@ -49,11 +57,14 @@ class OnnxTracker(Controller):
         inputs: Inputs = "errors",
         control_scale: list[float] | None = None,
         control_offset: list[float] | None = None,
+        precision: Precision = "real",
         network: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         if network is None:
             raise ConfigError("tracker: a network of an ONNX file is made by train-tracker")
+        check_precision(precision)
+        self.precision = precision
         self._set(state_dim, control_dim, inputs, _restored(network))
         self._scaled(control_scale, control_offset)
         self.path = path
@@ -88,6 +99,7 @@ class OnnxTracker(Controller):
             "inputs": self.inputs,
             "control_scale": self.control_scale.tolist(),
             "control_offset": self.control_offset.tolist(),
+            "precision": self.precision,
             "network": as_data(self.network),
         }
 
@@ -106,6 +118,9 @@ class OnnxTracker(Controller):
 
     def control(self, window: Tensor, x: Tensor) -> Tensor:
         """Controls ``(..., m)``; see :class:`~sagemp_cli.loop.controller.Controller`."""
+        if self.precision == "float32":
+            h = self.network(self.features(window, x).float())
+            return scaled_in_float32(h, self.control_scale, self.control_offset)
         return self.network(self.features(window, x)) * self.control_scale + self.control_offset
 
     def _set(self, n: int, m: int, inputs: str, network: Network) -> None:

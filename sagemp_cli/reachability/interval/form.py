@@ -16,6 +16,7 @@ from torch import Tensor
 
 from sagemp_cli.reachability.program.kinds import join, pick
 from sagemp_cli.reachability.program.program import Instruction
+from sagemp_cli.reachability.relaxations import float32
 from sagemp_cli.reachability.relaxations.functions import contiguous, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.registry import relaxation
 from sagemp_cli.sets import round_down, round_up
@@ -49,6 +50,11 @@ def evaluate(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
     if i.kind == "linear":
         (operand,), (weight, bias) = operands, i.constants
         return _linear(operand, weight, bias)
+    if i.kind == "float32_linear":
+        (operand,), (weight, bias) = operands, i.constants
+        exact = _linear(operand, weight, bias)
+        sizes = float32.sizes_of_sums(*operand.bounds, weight.abs(), bias.abs())
+        return IntervalForm(*float32.widened(*exact.bounds, float32.error_of_sums(sizes, weight.shape[-1])))
     if i.kind in _RULES:
         return _RULES[i.kind](*operands)
     if i.kind == "atan2":

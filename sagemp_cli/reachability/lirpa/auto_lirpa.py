@@ -12,9 +12,10 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from sagemp_cli.errors import ConfigError
+from sagemp_cli.errors import ConfigError, UnsupportedOperationError
 from sagemp_cli.reachability.batch import recorded_and_batched
 from sagemp_cli.reachability.lirpa.adapter import METHODS, bound
+from sagemp_cli.reachability.program.kinds import FLOAT32
 from sagemp_cli.reachability.propagator import Loop, Propagator, Reach
 from sagemp_cli.sets import Box, Tube
 
@@ -57,6 +58,10 @@ class AutoLirpa(Propagator):
             UsageError: no usable auto_LiRPA is installed, or the boxes do not fit the loop.
         """
         known, start = recorded_and_batched(loop, start, disturbance)
+        if any(kind in FLOAT32 for program in known.programs for kind in program.kinds):
+            raise UnsupportedOperationError(
+                "auto_lirpa does not enclose float32 arithmetic; use affine, crown, best or interval"
+            )
         batch, n = start.lower.shape[:-1], start.dim
         lower, upper = (corner.reshape(-1, n) for corner in (start.lower, start.upper))
         # Cells often come with a copy of their reference each: equal references make one call.

@@ -40,7 +40,7 @@ def elementwise(kind: str, *operands: Any, name: str = "", limits: Sequence[Any]
     if vectors and _size(recorder, read[0]) == 1:
         vectors = [v[:1] for v in vectors]
     constants = (*vectors, *(exact(v, operation=name).reshape(()) for v in numbers))
-    result = recorder.write(kind, read, constants)
+    result = recorder.rounded(kind, recorder.write(kind, read, constants))
     whole = result.numel() == shape.numel()
     return Traced(recorder, result.reshape(shape if whole else [1] * len(shape)).expand(shape).clone())
 
@@ -90,6 +90,10 @@ def add_scaled(name: str, a: Any, b: Any, factor: Any) -> Traced:
 
 def add_parts(a: Traced, parts: list[Tensor]) -> Traced:
     """A value plus what is the sum of some constants."""
+    if a.recorder.float32:
+        raise UnsupportedOperationError(
+            "an operation that computes something from constants alone is not known in float32; compute it before"
+        )
     return functools.reduce(functools.partial(elementwise, "add"), parts, a)
 
 

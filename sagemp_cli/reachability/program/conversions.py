@@ -15,22 +15,33 @@ def same_type(dtype: Any) -> None:
     """Refuse all types but float64."""
     if dtype not in (None, torch.float64, torch.double):
         raise UnsupportedOperationError(
-            f"conversion to {dtype}: rounding is not part of the real-arithmetic loop that is bounded; "
-            f"leave the conversion out (float32 weights are taken as the exact numbers they are)"
+            f"conversion to {dtype}: rounding to it is not enclosed; leave the conversion out, or compute in float32 "
+            f"from x.float() on, which is enclosed (float32 weights are exact numbers in either case)"
         )
 
 
 @answers("to", "type", "type_as")
 def converted(x: Traced, *args: Any, **kwargs: Any) -> Traced:
-    """The value itself; only to float64 and on the CPU."""
+    """The value itself, or rounded to float32; on the CPU."""
+    rounded = False
     for target in (*args, *kwargs.values()):
-        if isinstance(target, torch.dtype):
-            same_type(target)
-        elif isinstance(target, (Tensor, Traced)):
-            same_type(target.dtype)
+        kind = target.dtype if isinstance(target, (Tensor, Traced)) else target
+        if isinstance(kind, torch.dtype):
+            rounded |= kind is torch.float32
+            same_type(None if rounded else kind)
         elif isinstance(target, (torch.device, str)) and str(target) not in ("cpu", "torch.DoubleTensor"):
-            raise UnsupportedOperationError(f"conversion to {target}: a step is bounded on the CPU in float64")
-    return x._like(x.ids)
+            raise UnsupportedOperationError(f"conversion to {target}: a step is bounded on the CPU")
+    return to_float32(x) if rounded else x._like(x.ids)
+
+
+@answers("float")
+def to_float32(x: Traced) -> Traced:
+    """The value rounded to float32; itself, if it is."""
+    if x.float32 or not x.numel():
+        return x._like(x.ids)
+    recorder = x.recorder
+    ids = recorder.write("float32", [recorder.operand(x.ids, full=True)])
+    return x._like(ids.reshape(x.shape))
 
 
 @answers("double", "cpu")
@@ -40,7 +51,6 @@ def same(x: Traced) -> Traced:
 
 
 _TYPES = {
-    "float": torch.float32,
     "half": torch.float16,
     "bfloat16": torch.bfloat16,
     "int": torch.int32,

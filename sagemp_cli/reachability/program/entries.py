@@ -13,6 +13,7 @@ from sagemp_cli.reachability.program.conversions import same_type
 from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.value import (
     ANSWERS,
+    ANSWERS_OF_MOVES,
     Traced,
     answers,
     ids_of,
@@ -64,6 +65,7 @@ def _rewrapped(recorder: Recorder, result: Any) -> Any:
     return type(result)([Traced(recorder, r) for r in result])
 
 
+ANSWERS_OF_MOVES.update(MOVES.split(), JOINS.split())
 for _word in MOVES.split():
     ANSWERS[_word] = functools.partial(_moved, _word)
 for _word in JOINS.split():

@@ -52,6 +52,8 @@ OF_ONE: Mapping[str, Function] = {
     "fmod": lambda a, period: torch.fmod(a, float(period)),
     "wrap": lambda a: torch.atan2(torch.sin(a), torch.cos(a)),
     "identity": lambda a: a,
+    "float32": lambda a: _rounded(a),
+    "float32_near": lambda a: _rounded(a),
 }
 """Functions of one vector, entry by entry, with their constants."""
 
@@ -69,9 +71,15 @@ OF_TWO: Mapping[str, Function] = {
 OF_THREE: Mapping[str, Function] = {"where": lambda c, a, b: torch.where(c > 0, a, b)}
 """Functions of three vectors, entry by entry; the same of vectors of one entry."""
 
+MATRICES = ("linear", "float32_linear")
+"""What has a matrix: exact, and as float32 arithmetic computes it, in whatever order it sums."""
+
+FLOAT32 = ("float32", "float32_near", "float32_linear")
+"""What stands for float32 arithmetic: a set, of which tensors get one number."""
+
 CONSTANTS: Mapping[str, tuple[str, ...]] = {
     "constant": ("the vector",),
-    "linear": ("matrix", "bias"),
+    **dict.fromkeys(MATRICES, ("matrix", "bias")),
     "leaky_relu": ("slope",),
     "elu": ("alpha",),
     "softplus": ("beta", "threshold"),
@@ -82,8 +90,22 @@ CONSTANTS: Mapping[str, tuple[str, ...]] = {
 }
 """The constants of the kinds that have any: vectors as long as the result, the matrix ``(r, c)``, else one number."""
 
-KINDS = (*INPUTS, "constant", "pick", "join", "linear", *OF_THREE, *OF_TWO, *OF_ONE)
+KINDS = (*INPUTS, "constant", "pick", "join", *MATRICES, *OF_THREE, *OF_TWO, *OF_ONE)
 """All of them."""
+
+
+def linear(value: Tensor, matrix: Tensor, bias: Tensor) -> Tensor:
+    """``M a + b``."""
+    return torch.nn.functional.linear(value, matrix, bias)
+
+
+def float32_linear(value: Tensor, matrix: Tensor, bias: Tensor) -> Tensor:
+    """The same, rounded to float32 once: one of the numbers that float32 arithmetic may give."""
+    return _rounded(linear(value, matrix, bias))
+
+
+def _rounded(value: Tensor) -> Tensor:
+    return value.float().to(value.dtype)
 
 
 def pick(value: Tensor, entries: Sequence[int]) -> Tensor:

@@ -36,7 +36,10 @@ def _linear(x: Traced, matrix: Tensor, shape: Sequence[int], bias: Tensor | None
         )
     operand = x.recorder.operand(x.ids, full=True)
     bias = matrix.new_zeros(len(matrix)) if bias is None else bias
-    return x._like(x.recorder.write("linear", [operand], [matrix, bias]).reshape(tuple(shape)))
+    kind = "float32_linear" if x.recorder.float32 else "linear"
+    if x.recorder.float32 and isinstance(operand, Tensor):
+        raise UnsupportedOperationError("sums of constants alone are not known in float32; compute them before")
+    return x._like(x.recorder.write(kind, [operand], [matrix, bias]).reshape(tuple(shape)))
 
 
 def _dims(dim: Any, count: int) -> list[int]:

@@ -1,6 +1,6 @@
 """What torch itself does with the memory of a value: which results are views, which are copies, how entries lie.
 
-Every operation on recorded values is also run by torch, on float64 tensors that lie in memory exactly as the ids do and
+Every operation on recorded values is also run by torch, on tensors that lie in memory exactly as the ids do and
 hold the numbers of the example. What torch makes a view of an operand becomes a view of its ids, what torch writes in
 place is written into the ids, and what it copies has the strides that torch gives it. So the next operation finds what
 it would find, and writing into a result changes what it would change. The numbers are compared as well.
@@ -18,6 +18,9 @@ from sagemp_cli.errors import UnsupportedOperationError
 
 _CLOSE = 1e-10
 """How far the recorded result may be from torch's at the example, relative to 1 plus the largest number involved."""
+
+_CLOSE_IN_FLOAT32 = 1e-4
+"""The same in float32; its roundings are compared closely where the program is compared with the step."""
 
 _NARROW = (torch.float32, torch.float16, torch.bfloat16)
 
@@ -51,10 +54,11 @@ class Example:
 
     Args:
         kind: the type of recorded values.
+        native: whether values and constants keep their types, as where values are float32; else all is float64.
     """
 
-    def __init__(self, kind: type) -> None:
-        self._kind = kind
+    def __init__(self, kind: type, *, native: bool = False) -> None:
+        self._kind, self._native = kind, native
         self._blocks: dict[int, _Block] = {}
         self._constants: dict[int, Tensor] = {}
         self._largest: float | None = None  # number among the operands
@@ -78,7 +82,7 @@ class Example:
             return type(value)([self._placed(v) for v in value])
         if isinstance(value, (np.ndarray, np.generic)):
             value = torch.as_tensor(value)
-        value = widened(value)
+        value = value.detach() if self._native and isinstance(value, Tensor) else widened(value)
         if isinstance(value, Tensor):
             self._constants[value.untyped_storage()._cdata] = value
         return value
@@ -90,11 +94,17 @@ class Example:
         block = self._blocks.get(storage._cdata)
         if block is None:
             flat = ids.as_strided((storage.nbytes() // ids.element_size(),), (1,), 0)
-            numbers = self._recorder.example(flat)
-            if value.truth:
-                numbers = numbers.bool()
+            numbers = self._recorder.example(flat).to(value.dtype)
             self._blocks[storage._cdata] = block = _Block(flat, numbers)
         return block.numbers.as_strided(ids.size(), ids.stride(), ids.storage_offset())
+
+    @property
+    def result_type(self) -> torch.dtype | None:
+        """Type of what torch gave; of several tensors that of the first."""
+        first = self.result
+        while isinstance(first, (list, tuple)) and first:
+            first = first[0]
+        return first.dtype if isinstance(first, Tensor) else None
 
     def settle(self, answer: Any, name: str) -> Any:
         """The recorded result in the memory that torch gives it.
@@ -120,13 +130,15 @@ class Example:
             raise _other(name, f"gives shape {found}, recorded was {tuple(answer.shape)}")
         if self._is_constant(result):
             return result  # a view of a constant is that constant, and what is written into it is
-        truth = result.dtype is torch.bool
-        if result.dtype is not torch.float64 and not truth and not (name == "float" and self._of_truth):
+        truth, narrow = result.dtype is torch.bool, self._native and result.dtype is torch.float32
+        if not (result.dtype is torch.float64 or truth or narrow or (name == "float" and self._of_truth)):
             raise _other(name, f"gives {result.dtype}")
         ids = self._in_memory(answer.ids, result, name)
         if not self._same(ids, result):
             raise _other(name, "gives another number")
-        return type(answer)(answer.recorder, ids, truth=truth)
+        found = type(answer)(answer.recorder, ids, truth=truth)
+        found.float32 = narrow
+        return found
 
     def _in_memory(self, ids: Tensor, result: Tensor, name: str) -> Tensor:
         where = result.untyped_storage()._cdata
@@ -160,11 +172,13 @@ class Example:
         return self._largest
 
     def _same(self, ids: Tensor, numbers: Tensor) -> bool:
-        recorded = self._recorder.example(ids)
+        recorded, close = self._recorder.example(ids), _CLOSE
+        if numbers.dtype is torch.float32:
+            close = _CLOSE_IN_FLOAT32
         numbers = numbers.to(recorded.dtype)
         if torch.equal(recorded, numbers):  # the most frequent case by far, and quickly told
             return True
-        off = (recorded - numbers).abs() > _CLOSE * (self._find_largest() + numbers.abs())
+        off = (recorded - numbers).abs() > close * (self._find_largest() + numbers.abs())
         return not bool((off & (ids >= 0)).any())
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.program.kinds import INPUTS
+from sagemp_cli.reachability.program.kinds import INPUTS, MATRICES
 from sagemp_cli.reachability.program.program import Instruction, Program
 
 
@@ -57,6 +57,6 @@ def _through(i: Instruction, operands: Sequence[Tensor]) -> Tensor:
         return operands[0][torch.tensor(i.entries)]
     if i.kind == "join":
         return torch.cat(list(operands))
-    if i.kind == "linear":
+    if i.kind in MATRICES:
         return ((i.constants[0] != 0) & operands[0]).any(-1)
     return functools.reduce(operator.or_, operands).expand(i.size)

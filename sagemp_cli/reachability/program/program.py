@@ -15,7 +15,19 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import UsageError
-from sagemp_cli.reachability.program.kinds import CONSTANTS, INPUTS, KINDS, OF_ONE, OF_THREE, OF_TWO, join, pick
+from sagemp_cli.reachability.program.kinds import (
+    CONSTANTS,
+    INPUTS,
+    KINDS,
+    MATRICES,
+    OF_ONE,
+    OF_THREE,
+    OF_TWO,
+    float32_linear,
+    join,
+    linear,
+    pick,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +56,8 @@ class Instruction:
             return pick(operands[0], self.entries)
         if self.kind == "join":
             return join(operands)
-        if self.kind == "linear":
-            return torch.nn.functional.linear(operands[0], *self.constants)
+        if self.kind in MATRICES:
+            return (linear if self.kind == "linear" else float32_linear)(operands[0], *self.constants)
         return (OF_ONE.get(self.kind) or OF_TWO.get(self.kind) or OF_THREE[self.kind])(*operands, *self.constants)
 
 
@@ -204,7 +216,7 @@ def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str 
     if i.kind not in (*INPUTS, "constant") and all(before[o].kind == "constant" for o in i.operands):
         return "reads constants only, which are one constant"
     sizes = [before[o].size for o in i.operands]
-    count = {"pick": 1, "linear": 1, "join": max(len(sizes), 1)}.get(
+    count = {"pick": 1, **dict.fromkeys(MATRICES, 1), "join": max(len(sizes), 1)}.get(
         i.kind, (i.kind in OF_ONE) + 2 * (i.kind in OF_TWO) + 3 * (i.kind in OF_THREE)
     )
     if len(sizes) != count:
@@ -214,7 +226,7 @@ def _complaint(i: Instruction, slot: int, before: Sequence[Instruction]) -> str 
     made = {
         "pick": len(i.entries),
         "join": sum(sizes),
-        "linear": i.size,
+        **dict.fromkeys(MATRICES, i.size),
     }.get(i.kind, max(sizes, default=i.size))
     if i.size != made or (len(sizes) > 1 and i.kind != "join" and not set(sizes) <= {1, made}):
         return f"makes {i.size} entries of {sizes}"

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import SagempError, UsageError
-from sagemp_cli.reachability.program.kinds import INPUTS
+from sagemp_cli.reachability.program.float32 import error_kind
+from sagemp_cli.reachability.program.kinds import INPUTS, MATRICES
 from sagemp_cli.reachability.program.program import Instruction, Program, program_of
 
 
@@ -35,6 +36,7 @@ class Recorder:
         state, disturbance, numbers: ids of these.
         zero: the id of the constant 0, which is 0: operations that fill with zeros fill with it.
         unwritten: the id of an entry that has no value yet.
+        float32: whether what is written now is computed in float32.
         refusal: the first error that said that the step cannot be bounded, should the step have caught it.
     """
 
@@ -43,6 +45,7 @@ class Recorder:
 
     def __init__(self, state: Tensor, disturbance: Tensor, numbers: Tensor) -> None:
         self.refusal: SagempError | None = None
+        self.float32 = False
         self._instructions: list[Instruction] = []
         self._starts: list[int] = []
         self._size = 0
@@ -103,7 +106,7 @@ class Recorder:
         Without a slot among the operands the result is constant: what torch makes of them.
         """
         sizes = [self.size_of(o) if isinstance(o, Slot) else len(o) for o in operands]
-        size = len(constants[0]) if kind == "linear" else max(sizes)
+        size = len(constants[0]) if kind in MATRICES else max(sizes)
         if not any(isinstance(o, Slot) for o in operands):
             return self.constant(Instruction(kind, size, constants=tuple(constants)).on(*operands))
         slots = tuple(o.index if isinstance(o, Slot) else self._constant_slot(o) for o in operands)
@@ -201,6 +204,11 @@ class Recorder:
                 read = [self.operand(a, full=len(a) > 1) for a in after]
                 made[slot] = self.write(i.kind, read, i.constants)
         return translated(ids), tuple(kinds)
+
+    def rounded(self, kind: str, ids: Tensor) -> Tensor:
+        """Ids of what arithmetic makes of the result of an instruction: the same, unless it is float32."""
+        error = error_kind(kind) if self.float32 else None
+        return ids if error is None else self.write(error, [self.operand(ids, full=True)])
 
     def size_of(self, slot: Slot) -> int:
         """Entries of an instruction's result."""

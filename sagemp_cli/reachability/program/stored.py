@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from sagemp_cli.errors import ArtifactError, UsageError
+from sagemp_cli.reachability.program.kinds import MATRICES
 from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
 from sagemp_cli.storage.kinds import ProgramRecord
 
@@ -79,7 +80,7 @@ def _parts(begin: np.ndarray, whole: np.ndarray, name: str) -> list[np.ndarray]:
 def _constants(kind: str, size: int, operands: Sequence[int], numbers: np.ndarray) -> tuple[torch.Tensor, ...]:
     """An instruction's constants, shaped by its kind; that they are right is the program's to say."""
     flat = torch.from_numpy(np.array(numbers, dtype=np.float64))
-    if kind == "linear" and len(operands) == 1 and len(flat) == size * (operands[0] + 1):
+    if kind in MATRICES and len(operands) == 1 and len(flat) == size * (operands[0] + 1):
         return flat[:-size].reshape(size, operands[0]), flat[-size:]
     if kind == "clamp" and len(flat) == 2 * size:
         return flat[:size], flat[size:]

@@ -13,6 +13,7 @@ Longer than other files: one class has to answer all that a tensor is asked.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, cast
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.program import float32
 from sagemp_cli.reachability.program.memory import Example
 from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.tape import asked
@@ -88,6 +90,7 @@ class Traced(Tensor):
     ids: Tensor
     recorder: Recorder
     truth: bool
+    float32: bool  # whether torch computes with it in float32
 
     @staticmethod
     def __new__(cls, recorder: Recorder, ids: Tensor, *, truth: bool = False) -> Traced:
@@ -97,6 +100,7 @@ class Traced(Tensor):
         value.ids = ids
         value.recorder = recorder
         value.truth = truth
+        value.float32 = False
         return value
 
     __hash__ = object.__hash__
@@ -106,7 +110,7 @@ class Traced(Tensor):
     if not TYPE_CHECKING:  # torch declares attributes, which it takes no property for
         shape = property(lambda self: self.ids.shape)
         ndim = property(lambda self: self.ids.dim())
-        dtype = property(lambda self: torch.bool if self.truth else torch.float64)
+        dtype = property(lambda self: _type(self))
         device = property(lambda self: self.ids.device)
         layout = property(lambda self: torch.strided)
         requires_grad = is_cuda = is_sparse = is_quantized = is_nested = property(lambda self: False)
@@ -161,7 +165,9 @@ class Traced(Tensor):
         return f"Traced(shape={tuple(self.shape)})"
 
     def _like(self, ids: Tensor) -> Traced:
-        return cast(Any, Traced)(self.recorder, ids, truth=self.truth)
+        found = cast(Any, Traced)(self.recorder, ids, truth=self.truth)
+        found.float32 = self.float32
+        return found
 
     def _moved(self, name: str, ids: Callable[[Tensor], Tensor]) -> Traced:
         return asked(name, (self,), {}, lambda value: value._like(ids(value.ids)))
@@ -280,6 +286,13 @@ for _name, _function in {
 }.items():
     setattr(Traced, f"__{_name}__", _operator(_function))
 
+
+def _type(value: Traced) -> torch.dtype:
+    if value.truth:
+        return torch.bool
+    return torch.float32 if value.float32 else torch.float64
+
+
 UFUNCS = {
     "add": torch.add,
     "subtract": torch.sub,
@@ -294,6 +307,9 @@ UFUNCS = {
 ANSWERS: dict[Any, Callable[..., Any]] = {}
 """What torch functions and tensor methods do on traced values: by name, or the function itself."""
 
+ANSWERS_OF_MOVES: set[str] = set()
+"""Of these the names of those that only move entries, which do the same to values of any type."""
+
 
 def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Register what torch functions do, given by their names or as they are."""
@@ -307,6 +323,10 @@ def answers(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 
 def _assign(value: Traced, index: Any, part: Any) -> None:
+    if value.float32 and isinstance(part, Traced) and not part.float32:
+        value._refuse(str(float32.mixed("assignment")))
+    if value.float32 and not isinstance(part, Traced):
+        part = float32.as_float32(part, "assignment")
     if isinstance(index, Traced) and index.truth:
         part = _answered(torch.where, (index, part, value), {})
         index = ...
@@ -351,14 +371,22 @@ def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
         return ANSWERS[name](*args, **kwargs)
     answer = _in_place(name, args) if name.endswith("_") and not name.endswith("__") else _answer_of(function, name)
     # Torch goes first: what it refuses it must refuse before anything is written.
-    example = Example(Traced).run(function, args, kwargs)
+    narrow = float32.contains((args, kwargs), Traced, float32=True)
+    native = narrow or (name in float32.CONVERSIONS and not (isinstance(args[0], Traced) and args[0].truth))
+    example = Example(Traced, native=native).run(function, args, kwargs)
     kwargs.pop("inplace", None)  # torch's functions hand it over by name
+    narrow &= example.result_type in (torch.float32, torch.bool)
+    if narrow:
+        float32.require_known(name, ANSWERS_OF_MOVES)
+        float32.require_one_type(name, (args, kwargs), Traced)
+        args, kwargs = (float32.as_float32(given, name) for given in (args, kwargs))
     if name == "float" and args[0].truth:  # 1 and 0 in any type
         answer = ANSWERS["double"]
     if name != "where":
         args, kwargs = _as_numbers(args), _as_numbers(kwargs)
     try:
-        return example.settle(answer(*args, **kwargs), name)
+        with _computing_in_float32(args, kwargs) if narrow else contextlib.nullcontext():
+            return example.settle(answer(*args, **kwargs), name)
     except TypeError as error:
         raise UnsupportedOperationError(
             f"torch operation '{name}' is not supported with these arguments: {error}"
@@ -372,6 +400,28 @@ def _as_numbers(value: Any) -> Any:
     if type(value) in (list, tuple):
         return type(value)(map(_as_numbers, value))
     return {key: _as_numbers(one) for key, one in value.items()} if type(value) is dict else value
+
+
+@contextlib.contextmanager
+def _computing_in_float32(*arguments: Any) -> Iterator[None]:
+    """What is recorded meanwhile is computed in float32."""
+    recorder = _first(arguments).recorder
+    recorder.float32 = True
+    try:
+        yield
+    finally:
+        recorder.float32 = False
+
+
+def _first(values: Any) -> Any:
+    """The first recorded value among arguments."""
+    for value in values.values() if isinstance(values, dict) else values:
+        found = value if isinstance(value, Traced) else None
+        if found is None and type(value) in (list, tuple, dict):
+            found = _first(value)
+        if found is not None:
+            return found
+    return None
 
 
 def _answer_of(function: Any, name: str) -> Callable[..., Any]:

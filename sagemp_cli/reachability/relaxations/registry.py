@@ -17,6 +17,7 @@ from sagemp_cli.reachability.relaxations import clamp as _clamp
 from sagemp_cli.reachability.relaxations import elu as _elu
 from sagemp_cli.reachability.relaxations import error_function as _error_function
 from sagemp_cli.reachability.relaxations import exponential as _exponential
+from sagemp_cli.reachability.relaxations import float32 as _float32
 from sagemp_cli.reachability.relaxations import gelu as _gelu
 from sagemp_cli.reachability.relaxations import hardswish as _hardswish
 from sagemp_cli.reachability.relaxations import identity as _identity
@@ -117,6 +118,10 @@ OPERATIONS: dict[str, Operation] = {
     "identity": _of(_identity, arrays=True, ranges=True),
     "atan2": _of(_arctangent2),
     "where": _of(_choice),
+    **dict.fromkeys(_float32.ERRORS, _of(_float32, arrays=True, ranges=True)),
+    "float32_linear": Operation(
+        _float32.band_within, _float32.lines_within, _float32.widened, arrays=True, ranges=True
+    ),
 }
 """Of every kind that is not linear, but products and quotients."""
 
@@ -144,6 +149,10 @@ def relaxation(kind: str, constants: tuple[Tensor, ...] = ()) -> Relaxation:
         exponent = float(constants[0])
         whole = int(exponent) if exponent == int(exponent) else exponent
         return Relaxation(f"pow({whole})", operation, (whole,))
+    if kind in _float32.ERRORS:
+        return Relaxation(kind, operation, _float32.ERRORS[kind])
+    if kind == "float32_linear":
+        return Relaxation(kind, operation, tuple(c.detach().abs() for c in constants))
     if kind == "clamp" and not all(bool((limit == limit[0]).all()) for limit in constants):
         return Relaxation(kind, operation, constants)
     return Relaxation(kind, operation, tuple(float(c.reshape(-1)[0]) for c in constants))

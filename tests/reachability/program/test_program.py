@@ -34,7 +34,8 @@ def every_kind(x, w, p):
     third = third + torch.floor(a) - torch.ceil(b) + torch.round(3 * c) * torch.trunc(2 * a) + torch.sign(b)
     third = third + torch.remainder(a, 0.7) - torch.fmod(b, 0.7) + torch.atan2(torch.sin(c), torch.cos(c))
     third = third + torch.where(a > 0.1, b, c) * (b >= c)
-    return torch.stack([first - second, third, 0.1 * fourth]) + w + p[1] * mixed, first[None], -x
+    narrow = f.linear(torch.tanh(x.float()), torch.tensor([[1.0, 2.0, 3.0]])).double()
+    return torch.stack([first - second, third, 0.1 * fourth]) + w + p[1] * mixed + narrow, first[None], -x
 
 
 X, P = torch.tensor([0.3, -0.5, 0.2]).double(), torch.tensor([1.0, 2.0]).double()
@@ -48,7 +49,8 @@ def test_every_kind_does_on_batches_what_torch_does_on_single_states():
     found = PROGRAM.run(x, w, p)
     expected = [every_kind(*row) for row in zip(x, w, p, strict=True)]
     for name, values in zip(("next", "control", "deviation"), zip(*expected, strict=True), strict=True):
-        torch.testing.assert_close(getattr(found, name), torch.stack(values), rtol=1e-14, atol=1e-14)
+        close = 1e-6 if name == "next" else 1e-14  # in float32 torch rounds more than once
+        torch.testing.assert_close(getattr(found, name), torch.stack(values), rtol=close, atol=close)
 
 
 @pytest.mark.parametrize("loop", [unicycle_loop(line(0.1)), AffineLoop()], ids=str)

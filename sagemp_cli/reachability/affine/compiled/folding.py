@@ -26,7 +26,7 @@ from sagemp_cli.reachability.program.program import Instruction, Outputs, Progra
 from sagemp_cli.reachability.relaxations.registry import Relaxation, relaxation
 from sagemp_cli.sets.rounding import TINY, dot, gamma
 
-Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum", "choice"]
+Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum", "choice", "sums"]
 
 
 class Combination(NamedTuple):
@@ -69,10 +69,11 @@ class Node(NamedTuple):
     Attributes:
         rule: "function", of one variable; "product"; "quotient", whose third operand is the reciprocal of the second;
             "angle", whose operands are y and x; "maximum" or "minimum" of a and b, whose operands are a - b, a and b;
-            "choice" of a where c is positive, else b, whose operands are a - b, c, a and b.
+            "choice" of a where c is positive, else b, whose operands are a - b, c, a and b;
+            "sums" in float32, whose operands are the exact sums and what was summed.
         operands: its operands, one after the other.
         size: entries of its result.
-        relaxation: of a function, an angle or a choice; of a maximum or minimum that of ``relu(a - b)``.
+        relaxation: of a function, an angle, a choice or sums; of a maximum or minimum that of ``relu(a - b)``.
         square: whether a product is of one value with itself.
     """
 
@@ -152,6 +153,9 @@ class _Folding:
             return self._linear(i, operands)
         if i.kind == "neg":
             return operands[0]._replace(matrix=-operands[0].matrix)
+        if i.kind == "float32_linear":
+            exact = self._linear(i, operands)
+            return self._node("sums", i.size, _joined([exact, operands[0]]), relaxation(i.kind, i.constants))
         if len(operands) == 1:
             return self._node("function", i.size, operands[0], relaxation(i.kind, i.constants))
         *condition, a, b = (o if len(o.matrix) == i.size else o.moved(lambda t: t.expand(i.size, -1)) for o in operands)

@@ -24,6 +24,7 @@ from torch import Tensor
 from sagemp_cli.reachability.affine.compiled.folding import Combination, Compiled, Node
 from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.program.program import Instruction
+from sagemp_cli.reachability.relaxations.float32 import error_of_sums, sizes_of_sums, widened
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.rounding import SAFETY, TINY, combined
 
@@ -102,7 +103,9 @@ class Carried:
         node = self._of.nodes[i]
         if form is not None and node.rule in ("function", "product"):
             operands = _both(operands, form)
-        if node.rule == "function":
+        if node.rule == "sums":
+            found = _sums(node, operands)
+        elif node.rule == "function":
             assert node.relaxation is not None
             _, operation, parameters = node.relaxation
             found = operation.range_of(*operands, *parameters)
@@ -181,6 +184,14 @@ def _squares(node: Node) -> Array | None:
 def _both(a: Sides, b: Sides) -> Sides:
     """What holds if both hold; what is no number says nothing."""
     return np.fmax(a[0], b[0]), np.fmin(a[1], b[1])
+
+
+def _sums(node: Node, operands: Sides) -> Sides:
+    """Sums in float32 from intervals of the exact ones and of what was summed."""
+    assert node.relaxation is not None
+    matrix, bias = (p.numpy() for p in node.relaxation.parameters)
+    (low, terms_low), (high, terms_high) = (np.split(side, [node.size], axis=-1) for side in operands)
+    return widened(low, high, error_of_sums(sizes_of_sums(terms_low, terms_high, matrix, bias), matrix.shape[-1]))
 
 
 def _result(node: Node, operands: Sides, squares: Array | None) -> Any:

@@ -28,6 +28,7 @@ from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
 from sagemp_cli.reachability.relaxations import choice as _choices
 from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
+from sagemp_cli.reachability.relaxations.float32 import error_of_sums, sizes_of_sums
 from sagemp_cli.reachability.relaxations.functions import constant, contiguous, functions_of, on_tensors
 from sagemp_cli.reachability.relaxations.sine import sine_and_cosine_bands
 from sagemp_cli.sets.rounding import BAND, ROUNDED, SAFETY, SHIFT, SUM, TINY, of_generators, of_product, over_symbols
@@ -498,6 +499,21 @@ def _angle(node: Node, frame: Frame, operands: Value) -> Value:
     return enclosed(node, frame, Bounded(across, lower, upper, band, given, turn))
 
 
+def _sums(node: Node, frame: Frame, operands: Value) -> Value:
+    """Sums of products as float32 arithmetic gives them: the exact ones, and an error that the terms' sizes bound."""
+    assert node.relaxation is not None
+    m, size = functions_of(operands.both), node.size
+    lower, upper = frame.operand_bounds(operands)
+    matrix, bias = (p if m is functions_of(p) else p.numpy() for p in node.relaxation.parameters)
+    with constant(lower):
+        terms = sizes_of_sums(lower[:, size:], upper[:, size:], matrix, bias)
+        error = error_of_sums(terms, matrix.shape[-1])
+    form = Value(operands.both[..., :size], operands.coefficients[:, :size], operands.error)
+    lower, upper = lower[:, :size], upper[:, :size]
+    band = node.relaxation.operation.band_of(lower, upper, error)
+    return enclosed(node, frame, Bounded(form, lower, upper, band, given=(error,)))
+
+
 ONE_KINK = ("relu", "leaky_relu")
 """Functions that are linear on either side of 0: of which side it is nothing more has to be known."""
 WIDE = 48
@@ -519,4 +535,5 @@ EVALUATE: dict[str, Callable[[Node, Frame, Value], Value]] = {
     "maximum": _extreme,
     "minimum": _extreme,
     "choice": _choice,
+    "sums": _sums,
 }
