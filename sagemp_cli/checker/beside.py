@@ -63,7 +63,7 @@ class Combinations:
                     read = [transformed(weights_of(instruction, len(read[0])), read[0]), *read]
                 else:
                     read = repeated(read)
-                if instruction.kind in ("maximum", "minimum", "where"):
+                if instruction.kind in ("maximum", "minimum", "logaddexp", "where"):
                     read.append([subtracted(a, b) for a, b in zip(*read[-2:], strict=True)])
                 self.operands[slot] = [_Combination(part) for part in read]
                 self.first[slot] = self.columns

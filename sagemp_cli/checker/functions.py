@@ -301,6 +301,17 @@ def softplus(beta: float, threshold: float) -> Function:
     return Function(((None, smooth, None), (begin, _line(1.0), None)))
 
 
+def log_of_sum(a: arb, b: arb) -> arb:
+    """``log(exp(a) + exp(b))``."""
+    return a.max(b) + (-abs(a - b)).exp().log1p()
+
+
+SOFTPLUS = _smooth(
+    lambda x: x.max(arb(0)) + (-abs(x)).exp().log1p(), _sigmoid, lambda x: _sigmoid(x) * _sigmoid(-x), bend=1
+)
+"""``log(1 + exp(x))`` throughout."""
+
+
 def integer_power(exponent: int) -> Function:
     """``x^p``."""
     p = exponent

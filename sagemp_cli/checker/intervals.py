@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from sagemp_cli.checker.balls import arb, arb_mat, ball, balls
-from sagemp_cli.checker.functions import FUNCTIONS, function_of
+from sagemp_cli.checker.functions import FUNCTIONS, function_of, log_of_sum
 from sagemp_cli.checker.points import Point
 from sagemp_cli.checker.program import INPUTS, Instruction, Program
 from sagemp_cli.checker.ranges import values as ranges_of
@@ -193,6 +193,7 @@ _PAIRS: Mapping[str, Callable[[Interval, Interval], Interval]] = {
     "mul": mul,
     "div": _div,
     "atan2": _atan2,
+    "logaddexp": lambda a, b: (log_of_sum(a[0], b[0]), log_of_sum(a[1], b[1])),
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sagemp_cli.checker.balls import arb, balls
 from sagemp_cli.checker.float32 import Rounding, of_sums
-from sagemp_cli.checker.functions import Function, clamp, function_of
+from sagemp_cli.checker.functions import Function, clamp, function_of, log_of_sum
 from sagemp_cli.checker.jumps import Sawtooth, Staircase
 from sagemp_cli.checker.program import INPUTS, MATRICES, Instruction, Program
 
@@ -89,4 +89,5 @@ _PAIRS: Mapping[str, Callable[[arb, arb], arb]] = {
     "maximum": arb.max,
     "minimum": arb.min,
     "atan2": lambda y, x: arb.atan2(y, x),
+    "logaddexp": log_of_sum,
 }

@@ -22,7 +22,7 @@ SCALARS = (
 )  # fmt: skip
 WITH_NUMBERS: Mapping[str, int] = {"leaky_relu": 1, "elu": 1, "softplus": 2, "pow": 1, "remainder": 1, "fmod": 1}
 """Functions of one value that have constants, and how many."""
-PAIRS = ("add", "sub", "mul", "div", "maximum", "minimum", "atan2")
+PAIRS = ("add", "sub", "mul", "div", "maximum", "minimum", "atan2", "logaddexp")
 TRIPLES = ("where",)
 FLOAT32 = ("float32", "float32_near", "float32_linear")
 """What stands for float32 arithmetic; docs/program.md says what it may give."""
@@ -268,6 +268,8 @@ def _relaxations(
         return (*divisor, ("product", width)) if all(given) else divisor
     if kind in ("maximum", "minimum"):
         return (("relu" if all(given) else "clamp", width),)
+    if kind == "logaddexp":
+        return (("softplus", width),)
     beside = {"atan2": (("direction", width),), "where": (("ratio", width),)}.get(kind, ())
     return ((kind, width), *beside)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from sagemp_cli.checker.balls import arb, ball
 from sagemp_cli.checker.float32 import of_sums, sizes
-from sagemp_cli.checker.functions import function_of
+from sagemp_cli.checker.functions import function_of, log_of_sum
 from sagemp_cli.checker.program import Instruction
 from sagemp_cli.checker.rows import weights_of
 from sagemp_cli.checker.unproved import Unproved
@@ -181,6 +181,7 @@ _PAIRS: dict[str, Callable[[tuple[arb, arb], tuple[arb, arb]], Range]] = {
     "atan2": _angle,
     "maximum": lambda a, b: (a[0].max(b[0]), a[1].max(b[1])),
     "minimum": lambda a, b: (a[0].min(b[0]), a[1].min(b[1])),
+    "logaddexp": lambda a, b: (log_of_sum(a[0], b[0]), log_of_sum(a[1], b[1])),
 }
 
 _OWN: dict[str, Callable[[tuple[arb, arb]], Range]] = {

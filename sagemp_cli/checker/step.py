@@ -18,7 +18,7 @@ from sagemp_cli.checker.angle import Turned, angle_excess
 from sagemp_cli.checker.balls import arb, arb_mat, ball
 from sagemp_cli.checker.beside import Beside
 from sagemp_cli.checker.float32 import around, of_sums, sizes
-from sagemp_cli.checker.functions import FUNCTIONS
+from sagemp_cli.checker.functions import FUNCTIONS, SOFTPLUS
 from sagemp_cli.checker.loop import Loop
 from sagemp_cli.checker.points import functions_of
 from sagemp_cli.checker.program import Instruction
@@ -142,6 +142,8 @@ class Step:
                 if all(given)
                 else self._limited(kind, operands, given, within)
             )
+        elif kind == "logaddexp":
+            rows = self._log_of_sum(*_pair(repeated(operands)), within)
         elif kind == "atan2":
             rows = self._angle(*_pair(repeated(operands)), within)
         elif kind == "where":
@@ -237,6 +239,12 @@ class Step:
             return [added(b, c) for b, c in zip(right, above, strict=True)]
         return [subtracted(a, c) for a, c in zip(left, above, strict=True)]
 
+    def _log_of_sum(self, left: Rows, right: Rows, within: Sequence[list[Range]]) -> Rows:
+        """``log(exp(a) + exp(b)) = b + softplus(a - b)``."""
+        rest = [subtracted(a, b) for a, b in zip(left, right, strict=True)]
+        above = self._relaxed("softplus", rest, [SOFTPLUS.excess] * len(rest), within[2])
+        return [added(b, c) for b, c in zip(right, above, strict=True)]
+
     def _limited(
         self, kind: str, operands: Sequence[Rows], given: Sequence[bool], within: Sequence[list[Range]]
     ) -> Rows:
@@ -266,12 +274,13 @@ class Step:
         return out
 
     def _choice(self, condition: Rows, left: Rows, right: Rows, within: Sequence[list[Range]]) -> Rows:
-        """``b`` and, where c is positive, ``d = a - b``; where it is known which, a or b itself.
+        """``b`` and, where c is positive, ``d = a - b``; where the record says that it is known which, a or b itself.
 
         Around ``s d``, s the recorded slope, what is left is ``(1 - s) d`` where c is positive and ``-s d`` elsewhere;
         on either side d is ``r c + rest`` for the recorded ratio r as for any other, c between 0 and its own end.
         """
-        entries, ratios = self._take(len(left)), [ball(e.slope) for e in self._take(len(left))]
+        entries, beside = self._take(len(left)), self._take(len(left))
+        ratios = [ball(e.slope) for e in beside]
         rows = [subtracted(a, b) for a, b in zip(left, right, strict=True)]
         rest = [subtracted(d, times(c, r)) for d, c, r in zip(rows, condition, ratios, strict=True)]
         c = _within(self.bounds(condition), within[0])
@@ -279,10 +288,11 @@ class Step:
         d, free = _within(self.bounds(rows), within[3]), self.bounds(rest)
         out = []
         for i, entry in enumerate(entries):
-            if c[i][0] > 0 or c[i][1] <= 0:
-                out.append(
-                    self._put("where", list(left[i] if c[i][0] > 0 else right[i]), (ZERO, ZERO), entry, offset=False)
-                )
+            if beside[i].offset:
+                first = beside[i].offset > 0
+                if not (c[i][0] > 0 if first else c[i][1] <= 0):
+                    raise Unproved("a condition is not decided as it is recorded")
+                out.append(self._put("where", list(left[i] if first else right[i]), (ZERO, ZERO), entry, offset=False))
                 continue
             slope = ball(entry.slope)
             ends = []

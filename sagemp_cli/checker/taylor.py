@@ -24,7 +24,7 @@ SMOOTH = (
 _GELU = 2 * 0.7978845608028654, 0.044715
 """The factors of ``p = 2 c (a + d a^3)`` in ``gelu_tanh a = a sigmoid(p)``."""
 _EACH = ("pick", "join", "linear", "neg", "add", "sub", "identity")
-RATES = ("state", "numbers", "constant", "mul", "div", "atan2", *_EACH, *SMOOTH)
+RATES = ("state", "numbers", "constant", "mul", "div", "atan2", "logaddexp", *_EACH, *SMOOTH)
 """What a right-hand side may be made of; what it may not has a kink, or is the disturbance."""
 
 
@@ -76,6 +76,8 @@ class Expansion:
             return self._quotient(read[0], read[1], self._of[slot], q)
         if kind == "atan2":
             return self._angle(slot, read[0], read[1], q)
+        if kind == "logaddexp":
+            return self._log_of_sum(slot, read[0], read[1], q)
         if kind in ("sin", "cos"):
             return self._turn(i.reads[0], q)[kind == "cos"]
         if kind == "pow":
@@ -179,6 +181,15 @@ class Expansion:
             if i < q:
                 total = self._sum("sub", total, self._scaled(self._times(own[i], square[q - i]), i))
         return self._over(self._quotient_by(total, square[0]), q)
+
+    def _log_of_sum(self, slot: int, a: Series, b: Series, q: int) -> Value:
+        rest, s, slope = (self._beside(slot, name) for name in ("rest", "sigmoid", "slope"))
+        rest.append(self._sum("sub", a[q], b[q]))
+        s.append(self.out.put("sigmoid", _sure(rest[0])) if q == 0 else self._chain(rest, slope, q))
+        slope.append(self._sum("sub", s[q], self._squares(s, q)))
+        if q == 0:
+            return self.out.put("logaddexp", _sure(a[0]), _sure(b[0]))
+        return self._sum("add", b[q], self._chain(rest, s, q))
 
     # -- functions of one value --------------------------------------------------------------------------------------
 

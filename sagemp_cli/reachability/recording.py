@@ -19,12 +19,14 @@ from sagemp_cli.reachability.relaxations.arctangent2 import Turn
 from sagemp_cli.reachability.relaxations.band import Band
 
 
-def recorded_bands(name: str, band: Band, turn: Turn | None, ratio: Any = None) -> list[tuple[str, Band]]:
+def recorded_bands(
+    name: str, band: Band, turn: Turn | None, ratio: Any = None, given: Sequence[Any] = ()
+) -> list[tuple[str, Band]]:
     """What is kept of an operation: its band, and of an angle the direction that its line is across, of a choice the
-    ratio that its bounds rest on, written as one.
+    ratio that its bounds rest on and which branch was taken, written as one.
     """
     if ratio is not None:
-        return [(name, band), ("ratio", Band(ratio, 0.0 * ratio, 0.0 * ratio))]
+        return [(name, band), ("ratio", Band(ratio, given[0], 0.0 * ratio))]
     if turn is None:
         return [(name, band)]
     return [(name, band), ("direction", Band(turn.cosine, turn.sine, 0.0 * turn.cosine))]

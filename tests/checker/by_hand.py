@@ -34,7 +34,7 @@ OF_ONE: dict[str, Callable] = {
 }  # fmt: skip
 OF_TWO: dict[str, Callable] = {
     "add": torch.add, "sub": torch.sub, "mul": torch.mul, "div": torch.div, "maximum": torch.maximum,
-    "minimum": torch.minimum, "atan2": torch.atan2,
+    "minimum": torch.minimum, "atan2": torch.atan2, "logaddexp": torch.logaddexp,
 }  # fmt: skip
 
 

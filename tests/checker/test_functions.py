@@ -7,7 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagemp_cli.checker.balls import Unproved
-from sagemp_cli.checker.functions import FUNCTIONS, Smooth, clamp, elu, integer_power, leaky_relu, power, softplus
+from sagemp_cli.checker.functions import (
+    FUNCTIONS,
+    SOFTPLUS,
+    Smooth,
+    clamp,
+    elu,
+    integer_power,
+    leaky_relu,
+    power,
+    softplus,
+)
 from sagemp_cli.checker.jumps import JUMPS, fmod, remainder
 
 NAMED = {
@@ -18,6 +28,7 @@ NAMED = {
     "elu": elu(1.0),
     "elu with a small alpha": elu(0.3),
     "elu with a large alpha": elu(2.5),
+    "smooth softplus": SOFTPLUS,
     "power 1.5": power(1.5),
     "power 0.3": power(0.3),
     "power -0.7": power(-0.7),

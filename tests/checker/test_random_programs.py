@@ -133,3 +133,28 @@ def test_relaxations_that_intervals_do_not_allow_are_refused(squashed, what, see
         assert answer != ""
     elif answer:
         assert "relaxation" in answer or "scale" in answer or "state" in answer
+
+
+@pytest.mark.parametrize("name", ["a limit by hand", "a switch"])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_branch_is_not_taken_where_its_condition_is_not_decided(name, side):
+    with torch.no_grad():
+        made, program = claim(
+            Loop(SQUASHED[name]), Box.around([0.1, -0.2], [0.8, 0.9]), Box.around([0.0] * 2, [0.02] * 2)
+        )
+    names = [name for slot in program.relaxed for name, count in slot for _ in range(count)]
+    entry = names.index("ratio")
+    assert made.offset[0, entry] == 0.0 and proved(made, program) == ""
+    offset = made.offset.copy()
+    offset[0, entry] = side
+    assert "not decided as it is recorded" in proved(dataclasses.replace(made, offset=offset), program)
+
+
+def test_a_branch_that_is_decided_is_itself_and_not_the_other_one():
+    loop = Loop(lambda x, w: torch.where(x > -3.0, 0.5 * x, 0.7 * x) + w)
+    with torch.no_grad():
+        made, program = claim(loop, Box.around([0.1, -0.2], [0.8, 0.9]), Box.around([0.0] * 2, [0.02] * 2))
+    assert proved(made, program) == ""
+    assert (made.offset == 1.0).any()
+    other = np.where(made.offset == 1.0, -1.0, made.offset)
+    assert proved(dataclasses.replace(made, offset=other), program) != ""

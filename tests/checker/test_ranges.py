@@ -62,7 +62,7 @@ def test_a_range_is_what_every_state_keeps_to(name):
         assert ends is None or (ends[0] <= of_entry.min() and of_entry.max() <= ends[1])
 
 
-KINDS = [*((kind, ()) for kind in (*OF_ONE, "mul", "div", "maximum", "minimum", "atan2") if kind != "neg")]
+KINDS = [*((kind, ()) for kind in (*OF_ONE, "mul", "div", "maximum", "minimum", "logaddexp", "atan2") if kind != "neg")]
 KINDS += [
     *(("pow", (e,)) for e in (2, 3, 4, -1, -2, -3, 1.5, 0.3, -0.7)),
     ("remainder", (0.7,)),

@@ -38,7 +38,8 @@ def bounds(made, record=(), numbers=(), *, by_rows=False):
 def record_of(made, entry, direction=(0.8, 0.6)):
     """The same entry for every relaxation."""
     names = [name for slot in made.relaxed for name, count in slot for _ in range(count)]
-    return [Entry(*direction, 0.0) if name == "direction" else entry for name in names]
+    beside = {"direction": Entry(*direction, 0.0), "ratio": Entry(0.3, 0.0, 0.0)}
+    return [beside.get(name, entry) for name in names]
 
 
 def points(count=41):
@@ -113,6 +114,9 @@ NONLINEAR = {
     "atan2": [*PAIRS, line("atan2", 3, 2), line("join", 4, 4)],
     "atan2 of w": [line("add", X, W), line("atan2", X, 2), line("pick", 3, entries=[0, 0])],
     "atan2 behind": [*PAIRS, line("neg", 2), line("atan2", 2, 4), line("join", 5, W)],
+    "logaddexp": [*PAIRS, line("logaddexp", 2, 3), line("join", 4, W)],
+    "logaddexp of one entry": [*PAIRS, line("logaddexp", X, 3)],
+    "logaddexp of a number": [line("constant", constants=[0.1]), line("logaddexp", 2, X)],
     "where": [*PAIRS, line("where", 3, 2, 3), line("join", 4, W)],
     "where of branches that meet": [
         *PAIRS, line("constant", constants=[0.0]), line("where", 3, 3, 4), line("join", 5, W),

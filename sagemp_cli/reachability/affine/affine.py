@@ -245,7 +245,9 @@ class _Course:
     def take(self, done: Done, *, keep_steps: bool, symbols: int | None) -> None:
         """A step."""
         frame, after, states = done.frame, done.after, done.states
-        self.bands.append([pair for r in frame.relaxed for pair in recorded_bands(r.name, r.band, r.turn, r.ratio)])
+        self.bands.append(
+            [pair for r in frame.relaxed for pair in recorded_bands(r.name, r.band, r.turn, r.ratio, r.given)]
+        )
         if done.watched is not None:
             self.controls.append(done.watched)
         if keep_steps:

@@ -50,7 +50,7 @@ class Series:
                     f"'{i.kind}' stands in the right-hand side of the ODE, which must be smooth for a proof in "
                     f"continuous time; smooth ones are tanh, sigmoid, silu, sin, ..."
                 )
-            if i.kind not in (*INPUTS, "constant", *LINEAR, "mul", "div", "atan2", *RULES):
+            if i.kind not in (*INPUTS, "constant", *LINEAR, "mul", "div", "atan2", "logaddexp", *RULES):
                 raise UnsupportedOperationError(
                     f"'{i.kind}' stands in the right-hand side of the ODE, and no derivatives in time are written for "
                     f"it; they are for {', '.join(RULES)}"
@@ -79,7 +79,7 @@ class Series:
             return self._out.constant(i.constants[0]) if q == 0 else None
         if i.kind in LINEAR:
             return self._linear(i, q)
-        if i.kind in ("mul", "div", "atan2"):
+        if i.kind in ("mul", "div", "atan2", "logaddexp"):
             return getattr(self, f"_{i.kind}")(slot, *i.operands, q)
         return RULES[i.kind](self, slot, i, q)
 
@@ -174,6 +174,17 @@ class Series:
             if i < q:
                 total = self._sum(total, self._scaled(self._times(found[i], square[q - i]), i), "sub")
         return None if total is None else self._divided(self._out.of("div", total, _there(square[0])), q)
+
+    def _logaddexp(self, slot: int, a: int, b: int, q: int) -> int | None:
+        """``c' = b' + s d'`` with ``d = a - b`` and ``s = sigmoid(d)``."""
+        d, s, slope = (self.series_beside(name, slot) for name in ("difference", "sigmoid", "slope"))
+        first, second = self._values[a], self._values[b]
+        d.append(self._sum(first[q], second[q], "sub"))
+        s.append(self._out.of("sigmoid", _there(d[0])) if q == 0 else self._integrated(d, slope, q))
+        slope.append(self._sum(s[q], self._cauchy(s, s, q), "sub"))
+        if q == 0:
+            return self._out.of("logaddexp", _there(first[0]), _there(second[0]))
+        return self._sum(second[q], self._integrated(d, s, q))
 
     # -- functions of one value --------------------------------------------------------------------------------------
 

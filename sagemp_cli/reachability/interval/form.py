@@ -146,7 +146,17 @@ def _chosen(c: IntervalForm, a: IntervalForm, b: IntervalForm) -> IntervalForm:
     )
 
 
+def _log_of_sum(a: IntervalForm, b: IntervalForm) -> IntervalForm:
+    """It rises in both; what is computed is a sum of the larger one and of something in [0, log 2]."""
+    m, ends = functions_of(a.lower), []
+    for x, y, sign in ((a.lower, b.lower, -1.0), (a.upper, b.upper, 1.0)):
+        value = m.logaddexp(x, y)
+        ends.append(value + sign * (slack(1.0 + abs(m.maximum(x, y)), 16) + TINY))
+    return IntervalForm(*ends)
+
+
 _RULES = {
+    "logaddexp": _log_of_sum,
     "where": _chosen,
     "neg": _negative,
     "add": _sum,

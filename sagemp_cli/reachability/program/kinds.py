@@ -65,6 +65,7 @@ OF_TWO: Mapping[str, Function] = {
     "maximum": torch.maximum,
     "minimum": torch.minimum,
     "atan2": torch.atan2,
+    "logaddexp": torch.logaddexp,
 }
 """Functions of two vectors, entry by entry; a vector of one entry goes with every entry of the other."""
 

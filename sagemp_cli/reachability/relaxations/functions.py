@@ -44,6 +44,7 @@ def constant(x: Any) -> Any:
 
 class _Numpy:
     where, maximum, minimum, fmax, fmin, copysign = np.where, np.maximum, np.minimum, np.fmax, np.fmin, np.copysign
+    logaddexp = np.logaddexp
     sin, cos, acos, asin, sqrt = np.sin, np.cos, np.arccos, np.arcsin, np.sqrt
     ceil, floor, round, isfinite, cat = np.ceil, np.floor, np.rint, np.isfinite, np.concatenate
     zeros_like, ones_like, full_like = np.zeros_like, np.ones_like, np.full_like

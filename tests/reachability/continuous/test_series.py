@@ -22,6 +22,7 @@ RATES = {
     "powers that are not whole": lambda x: torch.stack([(x[0] + 1.5) ** 1.5, (x[1] + 2) ** -0.7]),
     "gelu in its tanh form": lambda x: torch.nn.functional.gelu(x * 1.5, approximate="tanh"),
     "what is left of periods": lambda x: torch.stack([torch.remainder(x[1] + 5, 2.0), torch.fmod(x[0] * x[1], 3.0)]),
+    "sums of exponentials": lambda x: torch.stack([torch.logaddexp(x[0], 2 * x[1]), torch.logaddexp(x[1], 0 * x[0])]),
     "a wrapped angle": lambda x: torch.stack([torch.atan2(torch.sin(x[1]), torch.cos(x[1])), x[0]]),
     "negative powers": lambda x: torch.stack([(x[0] + 1.5) ** -2, (x[1] + 2) ** -3]),
     "constant": lambda x: torch.stack([x[1], torch.tensor(-9.81, dtype=torch.float64) + 0 * x[0]]),

@@ -33,6 +33,7 @@ def every_kind(x, w, p):
     )
     third = third + torch.floor(a) - torch.ceil(b) + torch.round(3 * c) * torch.trunc(2 * a) + torch.sign(b)
     third = third + torch.remainder(a, 0.7) - torch.fmod(b, 0.7) + torch.atan2(torch.sin(c), torch.cos(c))
+    third = third + torch.logaddexp(a, 2 * b)
     third = third + torch.where(a > 0.1, b, c) * (b >= c)
     narrow = f.linear(torch.tanh(x.float()), torch.tensor([[1.0, 2.0, 3.0]])).double()
     return torch.stack([first - second, third, 0.1 * fourth]) + w + p[1] * mixed + narrow, first[None], -x

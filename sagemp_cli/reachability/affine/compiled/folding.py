@@ -26,7 +26,11 @@ from sagemp_cli.reachability.program.program import Instruction, Outputs, Progra
 from sagemp_cli.reachability.relaxations.registry import Relaxation, relaxation
 from sagemp_cli.sets.rounding import TINY, dot, gamma
 
-Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum", "choice", "sums"]
+Rule = Literal["function", "product", "quotient", "angle", "maximum", "minimum", "logaddexp", "choice", "sums"]
+
+
+_SMOOTH = torch.tensor(1.0, dtype=torch.float64), torch.tensor(1e300, dtype=torch.float64)
+"""Beta and threshold of a softplus that is smooth throughout."""
 
 
 class Combination(NamedTuple):
@@ -68,12 +72,14 @@ class Node(NamedTuple):
 
     Attributes:
         rule: "function", of one variable; "product"; "quotient", whose third operand is the reciprocal of the second;
-            "angle", whose operands are y and x; "maximum" or "minimum" of a and b, whose operands are a - b, a and b;
+            "angle", whose operands are y and x; "maximum", "minimum" or "logaddexp" of a and b, whose operands are
+            a - b, a and b;
             "choice" of a where c is positive, else b, whose operands are a - b, c, a and b;
             "sums" in float32, whose operands are the exact sums and what was summed.
         operands: its operands, one after the other.
         size: entries of its result.
-        relaxation: of a function, an angle, a choice or sums; of a maximum or minimum that of ``relu(a - b)``.
+        relaxation: of a function, an angle, a choice or sums; of a maximum or minimum that of ``relu(a - b)``, of a
+            logaddexp that of a softplus.
         square: whether a product is of one value with itself.
     """
 
@@ -172,6 +178,9 @@ class _Folding:
             return self._quotient(i, a, b, operands[1], constant)
         if i.kind == "atan2":
             return self._node("angle", i.size, _joined([a, b]), relaxation(i.kind))
+        if i.kind == "logaddexp":
+            how = relaxation("softplus", _SMOOTH)
+            return self._node("logaddexp", i.size, _joined([_sum(a, b, -1.0), a, b]), how)
         return self._extreme(i, a, b, constant)
 
     def _linear(self, i: Instruction, operands: Sequence[Combination]) -> Combination:

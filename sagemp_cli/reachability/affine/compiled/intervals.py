@@ -34,7 +34,7 @@ Sides = tuple[Array, Array]
 
 _KINDS = {
     "product": "mul", "quotient": "div", "angle": "atan2", "maximum": "maximum", "minimum": "minimum",
-    "choice": "where",
+    "logaddexp": "logaddexp", "choice": "where",
 }  # fmt: skip
 
 
@@ -197,7 +197,7 @@ def _sums(node: Node, operands: Sides) -> Sides:
 def _result(node: Node, operands: Sides, squares: Array | None) -> Any:
     """What an operation of two vectors makes of intervals, or a choice between them."""
     n = node.size
-    first = 1 if node.rule in ("maximum", "minimum", "choice") else 0  # the difference comes first
+    first = 1 if node.rule in ("maximum", "minimum", "logaddexp", "choice") else 0  # the difference comes first
     count = 3 if node.rule == "choice" else 2
     parts = [IntervalForm(*(side[:, i * n : (i + 1) * n] for side in operands)) for i in range(first, first + count)]
     instruction, a = Instruction(_KINDS[node.rule], n), parts[0]

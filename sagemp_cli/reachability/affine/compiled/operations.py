@@ -423,8 +423,10 @@ def _quotient(node: Node, frame: Frame, operands: Value) -> Value:
 
 
 def _extreme(node: Node, frame: Frame, operands: Value) -> Value:
-    """``maximum(a, b)`` is ``b + relu(a - b)`` and ``minimum(a, b)`` is ``a - relu(a - b)``."""
-    m, size, largest = functions_of(operands.both), node.size, node.rule == "maximum"
+    """``maximum(a, b)`` is ``b + relu(a - b)``, ``minimum(a, b)`` is ``a - relu(a - b)`` and ``logaddexp(a, b)`` is
+    ``b + softplus(a - b)``.
+    """
+    m, size, largest = functions_of(operands.both), node.size, node.rule != "minimum"
     difference = Value(operands.both[..., :size], operands.coefficients[:, :size], operands.error)
     above = _function(node, frame, difference)
     other = slice(2 * size, None) if largest else slice(size, 2 * size)
@@ -534,6 +536,7 @@ EVALUATE: dict[str, Callable[[Node, Frame, Value], Value]] = {
     "angle": _angle,
     "maximum": _extreme,
     "minimum": _extreme,
+    "logaddexp": _extreme,
     "choice": _choice,
     "sums": _sums,
 }
