@@ -1,19 +1,23 @@
 """Cells of other people's loops: those that ``partitions="auto"`` finds against even grids of about as many.
 
-``python benchmarks/cells.py --networks FOLDER [--only NAME ...]``, the folder with the ONNX files of ARCH-COMP AINNCS
-(``docs/arch_comp.md`` says where they are). Each loop is stepped by forward Euler, some steps a period. Widths are the
-geometric mean over steps and states, relative to one cell; times are processor time.
+``python benchmarks/cells.py --networks FOLDER [--only NAME ...] [--late]``, the folder with the ONNX files of ARCH-COMP
+AINNCS (``docs/arch_comp.md`` says where they are). Each loop is stepped by forward Euler, some steps a period. Widths
+are the geometric mean over steps and states, relative to one cell; times are processor time. With ``--late`` a set is
+halved in the middle of the horizon instead, along the generator that pays most, and what that narrows the steps after
+it by is compared with what the best halving of the start box does.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 import time
 import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +36,8 @@ from sagemp_cli.reachability.foreseeing import reach_foreseeing  # noqa: E402
 from sagemp_cli.reachability.narrowing import narrowing_cells  # noqa: E402
 from sagemp_cli.reachability.observed import Observed, observed  # noqa: E402
 from sagemp_cli.sets import Box, Tube  # noqa: E402
+from sagemp_cli.sets.partition import halved  # noqa: E402
+from sagemp_cli.sets.zonotope import Zonotope  # noqa: E402
 
 LOOPS = {
     "TORA": (Tora, 10, 20),
@@ -97,16 +103,46 @@ def measure(name: str, networks: Path) -> None:
         print(f"{name:12} {what:16} {cells:3} cells  width {width(tube) / width(one):.3f}  {seconds:.2f} s", flush=True)
 
 
+def late(name: str, networks: Path, tried: int = 10) -> None:
+    """The same, of halving a set later, along one of its largest generators."""
+    seen, affine = loop_of(name, networks), Affine()
+    loop, w, whole = seen.loop, seen.disturbance, cells_of(seen.start, [])
+    uncertain = [i for i in range(whole.dim) if whole.width[0, i] > 0]
+    started = [affine.propagate(loop, halved(whole, torch.tensor([i])), w).hull() for i in uncertain]
+    one = affine.propagate(loop, whole, w)
+    for k in (loop.horizon // 5, loop.horizon // 2):
+        before = affine.run(loop, whole, w, horizon=k)
+        assert before.last is not None
+        rest = dataclasses.replace(loop, numbers=loop.numbers[k:], horizon=loop.horizon - k)
+        center, generators = before.last.center[0], before.last.generators[0]
+        size = np.abs(generators) / np.abs(generators).sum(1, keepdims=True)
+        largest = np.argsort(-size.max(0))[:tried]
+        halves = [(center + sign * 0.5 * generators[:, j], j) for j in largest for sign in (-1, 1)]
+        cut = np.stack([np.where(np.arange(size.shape[1]) == j, 0.5, 1.0) * generators for _, j in halves])
+        box = before.tube.lower[:, -1], before.tube.upper[:, -1]
+        sets = Zonotope(np.stack([c for c, _ in halves]), cut)
+        low, high = torch.from_numpy(sets.low).maximum(box[0]), torch.from_numpy(sets.high).minimum(box[1])
+        tubes = affine.run(rest, Box(low, high), w, states=sets).tube
+        pairs = (Tube(tubes.lower[2 * i : 2 * i + 2], tubes.upper[2 * i : 2 * i + 2]) for i in range(len(largest)))
+        later = Tube(one.lower[:, k:], one.upper[:, k:])
+        found = [width(pair) / width(later) for pair in pairs]
+        early = min(width(Tube(t.lower[None, k:], t.upper[None, k:])) for t in started) / width(later)
+        born = "at the start" if largest[int(np.argmin(found))] < whole.dim else "later"
+        print(f"{name:12} steps {k} to {loop.horizon}: halved at step {k} {min(found):.3f} (a generator born {born}), "
+              f"at the start {early:.3f}", flush=True)  # fmt: skip
+
+
 def main() -> None:
     """Measure what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--networks", type=Path, required=True)
     parser.add_argument("--only", nargs="+", default=list(LOOPS), choices=list(LOOPS))
+    parser.add_argument("--late", action="store_true", help="halve sets in the middle of the horizon")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     for name in options.only:
-        measure(name, options.networks)
+        (late if options.late else measure)(name, options.networks)
 
 
 if __name__ == "__main__":
