@@ -17,7 +17,7 @@ class Transitions:
 
     Attributes:
         inputs: ``[x, u]``, ``(count, n + m)``.
-        increments: ``(x_next - x) / dt``, ``(count, n)``.
+        increments: ``(x_next - x) / dt``; of a robot in continuous time ``x'``; ``(count, n)``.
     """
 
     inputs: Tensor
@@ -26,9 +26,11 @@ class Transitions:
     @staticmethod
     @torch.no_grad()
     def draw(model: Dynamics, domain: Box, count: int, generator: torch.Generator) -> Transitions:
-        """States and controls uniform over a box ``(n + m,)``, one step each."""
+        """States and controls uniform over a box ``(n + m,)``, one step each, or one instant."""
         inputs = domain.sample(count, generator)
         x, u = inputs.split([model.state_dim, model.control_dim], dim=-1)
+        if model.continuous:  # over a period x' is not what it was
+            return Transitions(inputs, model.derivative(x, u))
         return Transitions(inputs, (model.step(x, u, torch.zeros_like(x)) - x) / model.dt)
 
 

@@ -63,7 +63,13 @@ def run(context: StageContext) -> Path:
     """
     (problem, robot_files), section = trained_problem(context), SECTIONS[0].made(context.config)
     proof = Proof.of(context.config, problem)
-    folded = TrueModelProof.of(context.config, proof) if robot_files else None
+    continuous = problem.dynamics.continuous
+    folded = TrueModelProof.of(context.config, proof) if robot_files and not continuous else None
+    if robot_files and continuous:
+        context.progress.say(
+            f"nothing is proved of {type(problem.dynamics.analytical).__name__} by way of the network: how they differ "
+            "is bounded in discrete time only; in continuous time that robot can be proved as the ODE that it is"
+        )
     planner_file, tracker_file = context.read("train-planner"), context.read("train-tracker")
     tracker = tracker_from(tracker_file)
     inputs: tuple[Artifact[Any] | Parent, ...] = (planner_file, tracker_file, *robot_files)

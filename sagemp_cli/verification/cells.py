@@ -290,8 +290,7 @@ class CellProver:
             return reach(self.propagator, known, chunk.cells, w, watch=True)
         if self.compared:
             raise UsageError(
-                "what is proved about a learned robot's analytical model is in discrete time; set "
-                "verify.true_model=null, or dynamics.time=discrete"
+                "what is proved about a learned robot's analytical model by way of the network is in discrete time"
             )
         known = dataclasses.replace(self._sampled, numbers=numbers, horizon=loop.horizon)
         substeps = chunk.substeps or self.division.substeps

@@ -8,11 +8,15 @@ import pytest
 import torch
 
 from sagemp_cli.checker.check import check
-from sagemp_cli.errors import ArtifactError
+from sagemp_cli.checker.claim import claim_rows
+from sagemp_cli.dynamics.unicycle import Unicycle
+from sagemp_cli.errors import ArtifactError, UsageError
+from sagemp_cli.identification.transitions import Transitions, domain_of
 from sagemp_cli.pipeline.loop_record import deviation_record
 from sagemp_cli.pipeline.true_model import split
 from sagemp_cli.pipeline.tubes import tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.sets import Between
 from sagemp_cli.storage import TrueModel
 from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verification import verify_references
@@ -168,3 +172,33 @@ def test_the_command_says_what_is_proved_of_which_model(learned):
     report = check(learned)
     assert "  the robot is a network learned from an analytical model; of that model itself:" in as_lines(report)
     assert as_data(report)["true_model"][0]["proved"] is True
+
+
+def test_a_network_as_the_right_hand_side_of_an_ode_is_proved_and_its_model_is_not(case, learned_unicycle, tmp_path):
+    section = copy.deepcopy(learned_unicycle.__defaults__[0])
+    section["model"]["time"] = "continuous"
+    robot = learned_unicycle(section)
+    problem = dataclasses.replace(case.problem, dynamics=robot, between=Between.CONTINUOUS)
+    references = torch.from_numpy(case.tubes.references)
+    found = verify_references(CellProver(Affine(), problem, case.tracker), references, counts=[2, 1])
+    config = case.config | {"dynamics": section}
+    made = dataclasses.replace(case, config=config, problem=problem, tubes=tubes_record(found))
+    report = check(made.write(tmp_path / "ode.h5"))
+    assert report.answer == "VERIFIED" and report.true_model is None
+    assert "tanh" in dict(claim_rows(report.document))["ODE"]
+    with pytest.raises(UsageError, match="by way of the network is in discrete time"):
+        verify_references(CellProver(Affine(), problem, case.tracker, compared=True), references, counts=[2, 1])
+
+
+def test_a_network_learns_the_rate_of_an_ode_and_the_increment_of_a_map():
+    limits = {
+        "control_lower": [-1.0] * 2,
+        "control_upper": [1.0] * 2,
+        "state_lower": [-1.0] * 4,
+        "state_upper": [1.0] * 4,
+    }
+    for time in ("discrete", "continuous"):
+        model = Unicycle(dt=0.5, time=time, **limits)
+        made = Transitions.draw(model, domain_of(model), 50, torch.Generator().manual_seed(0))
+        rates = model.derivative(*made.inputs.split([4, 2], dim=-1))
+        torch.testing.assert_close(made.increments, rates, rtol=1e-12, atol=1e-12)
