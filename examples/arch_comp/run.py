@@ -1,4 +1,5 @@
-"""All loops of ARCH-COMP AINNCS that are here: ``results.csv`` in the competition's format, and a figure of each."""
+"""All loops of ARCH-COMP AINNCS that are here: ``results.csv`` in the competition's format, a certificate and a figure
+of each, and ``checks.csv``: what ``sagemp check`` makes of the certificates, from these files alone."""
 
 import argparse
 import csv
@@ -17,6 +18,7 @@ from single_pendulum import SinglePendulum
 from tora import Tora
 from unicycle import Unicycle
 
+from sagemp_cli.checker.check import check
 from sagemp_cli.errors import SagempError
 from sagemp_cli.stages.prove_ode import plant_of, prove_ode
 
@@ -36,7 +38,7 @@ RESULTS = {"VERIFIED": "verified", "FALSIFIED": "falsified", "UNKNOWN": "unknown
 
 
 def main() -> int:
-    """Run what is asked for; 0 if all networks were there."""
+    """Run what is asked for; 0 if all networks were there and every certificate was proved again."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--networks", type=Path, required=True, help="folder with the ONNX files")
     parser.add_argument("--only", nargs="+", help="benchmarks, for instance TORA NAV", default=None)
@@ -49,7 +51,7 @@ def main() -> int:
         parser.error(f"no benchmark '{unknown[0]}'; known: {', '.join(sorted(known))}")
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
-    rows, missing = [], False
+    rows, checks, missing = [], [], False
     for (benchmark, instance), loop in LOOPS.items():
         if options.only and benchmark not in options.only:
             continue
@@ -58,10 +60,17 @@ def main() -> int:
             print(f"{benchmark} {instance}: {network} is not there", file=sys.stderr)
             missing = True
             continue
-        figure = options.output / f"{benchmark}_{instance}.png"
+        certificate = options.output / f"{benchmark}_{instance}.h5"
         called, began = f"{benchmark} {instance}", time.process_time()
         try:
-            proof = prove_ode(plant_of(loop, network), budget=options.budget, figure=figure, name=called)
+            proof = prove_ode(
+                plant_of(loop, network),
+                budget=options.budget,
+                certificate=certificate,
+                overwrite=True,
+                figure=certificate.with_suffix(".png"),
+                name=called,
+            )
         except SagempError as error:
             print(f"{benchmark} {instance}: {error}", file=sys.stderr)
             rows.append((benchmark, instance, "error", f"{time.process_time() - began:.2f}"))
@@ -70,9 +79,17 @@ def main() -> int:
         margins = ", ".join(f"{v.name} {v.margin:.4g} at {v.time:.4g} s" for v in proof.verdicts)
         cut = ", ".join(f"{d.substeps}x order {d.order}" for d in proof.divisions)
         print(f"{', '.join(rows[-1])}; {proof.cells} cells; {cut}; {margins}", flush=True)
-    with (options.output / "results.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("benchmark", "instance", "result", "time"), *rows])
-    return int(missing)
+        began = time.process_time()
+        found = RESULTS[check(certificate).answer]
+        checks.append((benchmark, instance, rows[-1][2], found, f"{time.process_time() - began:.2f}", certificate.name))
+        print(f"  checked: {found}, {checks[-1][4]}", flush=True)
+    for name, head, lines in (
+        ("results", ("benchmark", "instance", "result", "time"), rows),
+        ("checks", ("benchmark", "instance", "result", "checked", "time", "certificate"), checks),
+    ):
+        with (options.output / f"{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([head, *lines])
+    return int(missing or any(claimed != found for _, _, claimed, found, _, _ in checks))
 
 
 if __name__ == "__main__":

@@ -59,18 +59,18 @@ def box(sides: tuple[tuple[float, ...], tuple[float, ...]]) -> Box:
     return Box(*(torch.tensor(side, dtype=torch.float64) for side in sides))
 
 
-def proof(requirements=REQUIREMENTS, *, start=START, disturbance=W, **options: Any) -> OdeProof:
-    seen = observed_ode(rate, control, box(start), box(disturbance), period=PERIOD, horizon=K)
+def proof(requirements=REQUIREMENTS, *, start=START, disturbance=W, horizon=K, **options: Any) -> OdeProof:
+    seen = observed_ode(rate, control, box(start), box(disturbance), period=PERIOD, horizon=horizon)
     formulas = [r.formula(NAMES) for r in requirements]
     given = {"counts": [1, 1], "restarts": 0, "generator": torch.Generator().manual_seed(0)} | options
     return verify_ode(seen, Affine(), formulas, **given)
 
 
-def in_two_ways() -> OdeProof:
-    """One half of X_I with a period as a whole, the other with four parts of it."""
+def in_two_ways(requirements=REQUIREMENTS, *, parts: int = 4, **options: Any) -> OdeProof:
+    """One half of X_I with a period as a whole, the other with so many parts of it."""
     middle = 0.25
-    low = proof(start=(START[0], (middle, START[1][1])), substeps=1, order=3)
-    high = proof(start=((middle, START[0][1]), START[1]), substeps=4, order=2)
+    low = proof(requirements, start=(START[0], (middle, START[1][1])), substeps=1, order=3, **options)
+    high = proof(requirements, start=((middle, START[0][1]), START[1]), substeps=parts, order=2, **options)
     order = [Answer.FALSIFIED, Answer.UNKNOWN, Answer.VERIFIED]
     verdicts = tuple(
         dataclasses.replace(a, margin=min(a.margin, b.margin), answer=min(a.answer, b.answer, key=order.index))
@@ -79,16 +79,17 @@ def in_two_ways() -> OdeProof:
     return dataclasses.replace(low, start=box(START), pieces=(*low.pieces, *high.pieces), verdicts=verdicts)
 
 
-def config() -> dict[str, Any]:
+def config(horizon: int) -> dict[str, Any]:
     sets = {"start": START, "disturbance": W}
-    return {"name": "body", "horizon": K} | {
+    return {"name": "body", "horizon": horizon} | {
         name: {"lower": list(sides[0]), "upper": list(sides[1])} for name, sides in sets.items()
     }
 
 
 def written(made: OdeProof, path: Path) -> Certificate:
     record = ode_certificate(made, state_names=NAMES, state_units=UNITS)
-    write_artifact(path, record, Header(stage="prove", experiment="body", config=config()), overwrite=True)
+    header = Header(stage="prove", experiment="body", config=config(made.loop.horizon))
+    write_artifact(path, record, header, overwrite=True)
     return record
 
 

@@ -62,8 +62,10 @@ class Truth:
         return self.own[c][:, first : first + per, i]
 
 
-def solutions(document: Document, rng: np.random.Generator, count: int = 48) -> list[np.ndarray]:
-    """Of each cell, states ``(count, K FINE + 1, n)`` by Runge and Kutta's method, under switching signals."""
+def solutions(
+    document: Document, rng: np.random.Generator, count: int = 48, signal: np.ndarray | None = None
+) -> list[np.ndarray]:
+    """Of each cell, states ``(count, K FINE + 1, n)`` by Runge and Kutta's method, under switching signals or one."""
     tubes, ode, (control,) = document.tubes, document.ode, document.programs
     steps, h, found = document.horizon * FINE, document.dt / FINE, []
     low, high = tubes["disturbance_lower"], tubes["disturbance_upper"]
@@ -74,8 +76,8 @@ def solutions(document: Document, rng: np.random.Generator, count: int = 48) -> 
         x[: count // 2] = x[: count // 2].round()
         x = lower + x * (upper - lower)
         switches = rng.choice([steps, FINE, FINE // S, 4, 1], count)
-        signal = np.stack([np.repeat(rng.integers(0, 2, (steps, n)), every, axis=0)[:steps] for every in switches])
-        w, states = low + signal * (high - low), [x]
+        sides = np.stack([np.repeat(rng.integers(0, 2, (steps, n)), every, axis=0)[:steps] for every in switches])
+        w, states = low + sides * (high - low) if signal is None else signal[None], [x]
         with np.errstate(all="ignore"):
             for i in range(steps):
                 if i % FINE == 0:  # the control alone: its program with that as the next state

@@ -44,6 +44,9 @@ def test_the_command_writes_results_and_figures_and_says_what_is_not_there(tmp_p
         (row,) = csv.DictReader(file)
     assert list(row) == ["benchmark", "instance", "result", "time"]
     assert (row["benchmark"], row["result"]) == ("Single_Pendulum", "falsified")
+    with (tmp_path / "out" / "checks.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["result"], row["checked"], row["certificate"]) == ("falsified", "falsified", "Single_Pendulum_reach.h5")
     assert (tmp_path / "out" / "Single_Pendulum_reach.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -55,3 +58,5 @@ def test_the_published_properties_are_decided(tmp_path):
     assert found.returncode == 0, found.stderr
     with (tmp_path / "results.csv").open() as file:
         assert {row["benchmark"]: row["result"] for row in csv.DictReader(file)} == dict.fromkeys(names, "verified")
+    with (tmp_path / "checks.csv").open() as file:
+        assert {row["benchmark"]: row["checked"] for row in csv.DictReader(file)} == dict.fromkeys(names, "verified")
