@@ -24,6 +24,7 @@ from sagemp_cli.reachability.foreseeing import reach_foreseeing
 from sagemp_cli.reachability.observed import Observed
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator
+from sagemp_cli.reachability.unbounded import why_unbounded
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.sets import Between, Box, Tube
 from sagemp_cli.sets.between import moment
@@ -156,7 +157,7 @@ def verify_loop(
         state_names=claim.state_names,
         between=claim.between,
     )
-    n, steps = seen.start.dim, seen.loop.horizon
+    n, steps, bounded = seen.start.dim, seen.loop.horizon, judged.verdicts[0].outcome is not Outcome.UNBOUNDED
     first = 0 if claim.bounds_the_position else 1  # a workspace that is not there is no constraint
     verification = Verification(
         references=torch.full((1, steps + 1, n), torch.nan, dtype=torch.float64),
@@ -175,7 +176,10 @@ def verify_loop(
         propagator=propagator.name,
         rigorous=propagator.rigorous,
         recording=found.recording,
-        notes=found.notes,
+        notes=(
+            *found.notes,
+            *(() if bounded else (f"unbounded: {why_unbounded(seen.loop, found.tube, seen.disturbance)}",)),
+        ),
         between=claim.between,
     )
     return _attacked(seen, claim, verification, restarts, generator)
