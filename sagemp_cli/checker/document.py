@@ -231,8 +231,11 @@ def _read(file: Group, path: Path) -> Document:
     return dataclasses.replace(document, true_model=true)
 
 
-_REJECTED = ("rejected_references", "rejected_reason", "reason_names", "reason_counts")
-"""Of a library: what was sampled and not certified."""
+_REJECTED = (
+    *("rejected_references", "rejected_reason", "reason_names", "reason_counts"),
+    *("mode", "mode_names", "mode_drawn"),
+)
+"""Of a library: what was sampled and not certified, and on which sides references pass."""
 _SAMPLES = ("drawn", "certified")
 _SAID = ("experiment", "stage", "status", "version", "created_utc", "seconds")
 

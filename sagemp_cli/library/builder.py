@@ -1,15 +1,22 @@
-"""Algorithm 2 of the paper: sample references until enough of them are certified."""
+"""Algorithm 2 of the paper: sample references until enough of them are certified.
+
+Two things are added to it. An entry that repeats another one is worth nothing: references closer than a stated
+distance to one that is held are not taken. And a library may be filled mode by mode (:mod:`sagemp_cli.library.modes`):
+as long as its planner proposes several, none takes more than its even share.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import torch
 from torch import Tensor
 
 from sagemp_cli.errors import EXIT_UNKNOWN, ConfigError, SagempError
+from sagemp_cli.library.modes import Coverage, modes_of
 from sagemp_cli.progress import Progress, Silent
 from sagemp_cli.scenes.scene import Scene
 from sagemp_cli.verification.verdict import Outcome
@@ -20,8 +27,19 @@ REFERENCE_MISSES = "reference misses goal"
 TUBE_COLLIDES = "tube in collision"
 TUBE_MISSES = "tube misses goal"
 TUBE_UNBOUNDED = "tube unbounded"
-REASONS = (REFERENCE_COLLIDES, REFERENCE_MISSES, TUBE_COLLIDES, TUBE_MISSES, TUBE_UNBOUNDED)
+DUPLICATE = "duplicate of an entry"
+REASONS = (REFERENCE_COLLIDES, REFERENCE_MISSES, TUBE_COLLIDES, TUBE_MISSES, TUBE_UNBOUNDED, DUPLICATE)
 """Why a reference is not added to the library; the first two are found without propagating anything."""
+
+
+class Fill(StrEnum):
+    """Which certified references are taken."""
+
+    FIRST = "first"
+    """The first ones, as in the paper."""
+    MODES = "modes"
+    """Of each mode that the planner proposes as many, as far as there are."""
+
 
 REASON_OF = {
     Outcome.MAY_COLLIDE: TUBE_COLLIDES,
@@ -45,14 +63,18 @@ class Build:
         certified: the library, at least one and at most the wanted number of references.
         rejected: references that were not certified, ``(rejected, K+1, n)``.
         reasons: why, one of :data:`REASONS` each.
-        sampled: references drawn from the planner altogether; certified ones beyond the wanted number are
-            neither in the library nor among the rejected.
+        sampled: references drawn from the planner altogether; what was not needed is neither in the library nor
+            among the rejected.
+        modes: of each entry.
+        coverage: the modes proposed and those held.
     """
 
     certified: Verification
     rejected: Tensor
     reasons: tuple[str, ...]
     sampled: int
+    modes: tuple[str, ...]
+    coverage: Coverage
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -70,6 +92,8 @@ def build_library(
     wanted: int,
     budget: int,
     batch: int = 8,
+    apart: float = 0.0,
+    fill: Fill = Fill.FIRST,
     progress: Progress | None = None,
 ) -> Build:
     """Draw references in batches, reject or certify them, stop at ``wanted`` certified ones or at the budget.
@@ -82,6 +106,9 @@ def build_library(
         wanted: library size C.
         budget: references drawn at most.
         batch: references per draw, verified in one call.
+        apart: references whose positions are at every step closer than this to those of an entry repeat it.
+        fill: which certified references are taken. With ``MODES`` those of a mode that has its even share of the
+            modes seen so far are set aside; when the budget is over, what is left of the size is filled from them.
         progress: reports certified references.
 
     Raises:
@@ -92,33 +119,92 @@ def build_library(
             f"library: size and batch must be positive and budget at least size, "
             f"found size {wanted}, batch {batch}, budget {budget}"
         )
-    certified: list[Verification] = []
-    rejected: list[Tensor] = []
-    reasons: list[str] = []
-    sampled = have = 0
+    work = _Library(verify, list(position), wanted, apart)
+    drawn: list[str] = []
+    aside: list[tuple[Tensor, str]] = []
+    sampled = 0
     with (progress or Silent()).task("certified references", wanted) as task:
-        while have < wanted and sampled < budget:
+        while work.room and sampled < budget:
             references = draw(min(batch, budget - sampled))
             sampled += len(references)
             why = reference_faults(references, scene, position=position)
-            sound = [r for r, reason in enumerate(why) if not reason]
-            if sound:
-                found = verify(references[sound])
-                for r, verdict in zip(sound, found.verdicts, strict=True):
-                    if verdict.outcome is not Outcome.SAFE:
-                        why[r] = REASON_OF[verdict.outcome]
-                safe = found.safe[: wanted - have]
-                if safe:
-                    certified.append(found.select(safe))
-                have += len(safe)
-                task.advance(len(safe), f"{sampled} of {budget} sampled")
-            bad = [r for r, reason in enumerate(why) if reason]
-            rejected.append(references[bad])
-            reasons.extend(why[r] for r in bad)
-    if not certified:
-        why = ", ".join(f"{n} x {reason}" for reason, n in Counter(reasons).most_common())
+            work.reject(references[[r for r, reason in enumerate(why) if reason]], [reason for reason in why if reason])
+            sound = references[[r for r, reason in enumerate(why) if not reason]]
+            modes = modes_of(sound, scene, position=position)
+            drawn += modes
+            share = wanted if fill is Fill.FIRST else -(-wanted // max(1, len(set(drawn))))
+            task.advance(work.take(sound, modes, aside, share), f"{sampled} of {budget} sampled")
+        while work.room and aside:  # the even shares were not to be had
+            some, aside = aside[:batch], aside[batch:]
+            task.advance(work.take(torch.stack([r for r, _ in some]), [m for _, m in some], [], wanted))
+    if not work.certified:
+        why = ", ".join(f"{n} x {reason}" for reason, n in Counter(work.reasons).most_common())
         raise NothingCertifiedError(f"library: none of {sampled} sampled references could be certified ({why})")
-    return Build(Verification.join(certified), torch.cat(rejected), tuple(reasons), sampled)
+    return Build(
+        Verification.join(work.certified),
+        torch.cat(work.rejected),
+        tuple(work.reasons),
+        sampled,
+        tuple(work.modes),
+        Coverage.of(drawn, work.modes),
+    )
+
+
+class _Library:
+    """What is certified and what is rejected so far."""
+
+    def __init__(
+        self, verify: Callable[[Tensor], Verification], position: list[int], wanted: int, apart: float
+    ) -> None:
+        self.verify, self.position, self.wanted, self.apart = verify, position, wanted, apart
+        self.certified: list[Verification] = []
+        self.modes: list[str] = []
+        self.rejected: list[Tensor] = []
+        self.reasons: list[str] = []
+        self.paths: list[Tensor] = []
+
+    @property
+    def room(self) -> int:
+        return self.wanted - len(self.modes)
+
+    def reject(self, references: Tensor, reasons: Sequence[str]) -> None:
+        self.rejected.append(references)
+        self.reasons += reasons
+
+    def take(self, references: Tensor, modes: Sequence[str], aside: list[tuple[Tensor, str]], share: int) -> int:
+        """Prove those that may be taken, take those that are proved; how many those are."""
+        asked: list[int] = []
+        for r, mode in enumerate(modes):
+            if self._repeats(references[r]):
+                self.reject(references[r : r + 1], [DUPLICATE])
+            elif self.modes.count(mode) >= share:
+                aside.append((references[r], mode))
+            else:
+                asked.append(r)
+        if not asked:
+            return 0
+        found, taken = self.verify(references[asked]), list[int]()
+        for i, (r, verdict) in enumerate(zip(asked, found.verdicts, strict=True)):
+            if verdict.outcome is not Outcome.SAFE:
+                self.reject(references[r : r + 1], [REASON_OF[verdict.outcome]])
+            elif self._repeats(references[r]):
+                self.reject(references[r : r + 1], [DUPLICATE])
+            elif self.room and self.modes.count(modes[r]) < share:
+                taken.append(i)
+                self.modes.append(modes[r])
+                self.paths.append(references[r][:, self.position])
+            elif self.room:
+                aside.append((references[r], modes[r]))
+        if taken:
+            self.certified.append(found.select(taken))
+        return len(taken)
+
+    def _repeats(self, reference: Tensor) -> bool:
+        """Whether it is at every step closer than ``apart`` to an entry."""
+        if not self.paths or not self.apart:
+            return False
+        gap = torch.linalg.vector_norm(torch.stack(self.paths) - reference[:, self.position], dim=-1)
+        return bool((gap.amax(-1) < self.apart).any())
 
 
 def reference_faults(references: Tensor, scene: Scene, *, position: tuple[int, ...]) -> list[str]:

@@ -31,7 +31,7 @@ from sagemp_cli.storage import Artifact, Library
 
 
 def draw_library(artifact: Artifact[Library]) -> Figure:
-    """Tubes and references on the left, the account of all samples on the right."""
+    """Tubes and references on the left, in a colour for each mode; the account of all samples on the right."""
     record, problem = artifact.record, problem_of(artifact.header.config)
     tubes, plane = record.tubes, plane_of(problem)
     assert tubes.references is not None
@@ -47,13 +47,20 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         draw_paths(
             scene, record.rejected_references[mask][..., plane], colors=colour, linewidths=0.7, alpha=0.4, zorder=2.8
         )
+    names = [*record.mode_names, *sorted(set(record.mode) - set(record.mode_names))]
+    colour_of = {name: MODES[i % len(MODES)] for i, name in enumerate(names)}
     for r in range(count):
-        mine, colour = tubes.cell_reference == r, MODES[r % len(MODES)]
+        mine, colour = tubes.cell_reference == r, colour_of[record.mode[r]]
         lower, upper = tubes.tube_lower[mine].min(0)[:, plane], tubes.tube_upper[mine].max(0)[:, plane]
         draw_boxes(scene, lower, upper, facecolors=colour, edgecolors="none", alpha=0.09, zorder=3)
         draw_boxes(scene, lower, upper, facecolors="none", edgecolors=colour, linewidths=0.4, alpha=0.55, zorder=3.1)
         scene.plot(*tubes.references[r][:, plane].T, color=colour, linewidth=1.6, zorder=7)
-    handles = [Line2D([], [], color=MODES[0], lw=2, label="certified, with tube")]
+    proposed = dict(zip(record.mode_names, record.mode_drawn.tolist(), strict=True))
+    total = max(1, sum(proposed.values()))
+    handles = [
+        Line2D([], [], color=colour_of[name], lw=2, label=_mode(name, record.mode.count(name), proposed, total))
+        for name in names
+    ]
     if early.any():
         handles.append(Line2D([], [], color=DANGER, lw=2, label="reference rejected"))
     if (~early).any():
@@ -61,13 +68,16 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
     legend_above(scene, handles)
 
     axes = figure.add_subplot(grid[1])
-    names = ["certified", *record.reason_names, "certified, not needed"]
-    values = [count, *record.reason_counts.tolist()]
-    values.append(record.sampled - sum(values))  # references are drawn in batches, the last of which may bring too many
-    colours = [SAFE, *(DANGER if name.startswith("reference") else UNKNOWN for name in record.reason_names), MUTED]
+    rows = [("certified", count, SAFE)]
+    rows += [
+        (name, number, DANGER if name.startswith("reference") else UNKNOWN)
+        for name, number in zip(record.reason_names, record.reason_counts.tolist(), strict=True)
+    ]
+    rows.append(("not needed", record.sampled - sum(number for _, number, _ in rows), MUTED))
+    kinds, values, colours = zip(*(row for row in rows if row[1]), strict=True)
     style_axes(axes, xlabel="references sampled")
-    axes.barh(range(len(names)), values, color=colours, height=0.62)
-    axes.set_yticks(range(len(names)), names, fontsize=9, color=INK)
+    axes.barh(range(len(kinds)), values, color=colours, height=0.62)
+    axes.set_yticks(range(len(kinds)), kinds, fontsize=9, color=INK)
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -85,3 +95,10 @@ def draw_library(artifact: Artifact[Library]) -> Figure:
         colour=SAFE if count >= record.wanted else INK,
     )
     return figure
+
+
+def _mode(name: str, held: int, proposed: dict[str, int], total: int) -> str:
+    """What the legend says of a mode."""
+    if not name:
+        return "certified, with tube"
+    return f"{name}: {held} certified, {proposed.get(name, 0) / total:.0%} of the planner's"

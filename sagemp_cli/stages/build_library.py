@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from torch import Tensor
 
 from sagemp_cli.config.binding import Binding
-from sagemp_cli.config.ranges import Count, Whole
+from sagemp_cli.config.ranges import Count, NonNegative, Whole
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.library import REASONS, build_library
+from sagemp_cli.library import REASONS, Fill, build_library
 from sagemp_cli.pipeline.context import StageContext
 from sagemp_cli.pipeline.loop_record import loop_record
 from sagemp_cli.pipeline.models import planner_from, tracker_from
@@ -34,12 +35,18 @@ class Options:
         budget: references sampled at most.
         seed: of what is sampled.
         start_spread: share of X_I that they start in.
+        batch: references drawn and proved at a time.
+        apart: metres; references that are at every step closer than this to an entry repeat it and are not taken.
+        fill: which certified references are taken.
     """
 
     size: Count
     budget: Count
     seed: Whole
     start_spread: XIShare
+    batch: Count
+    apart: NonNegative
+    fill: Literal["first", "modes"]
 
     def __post_init__(self) -> None:
         if self.budget < self.size:
@@ -70,6 +77,9 @@ def run(context: StageContext) -> Path:
         position=problem.dynamics.position,
         wanted=section.size,
         budget=section.budget,
+        batch=section.batch,
+        apart=section.apart,
+        fill=Fill(section.fill),
         progress=context.progress,
     )
     attack(
@@ -79,6 +89,8 @@ def run(context: StageContext) -> Path:
         generator=context.generator("build-library: falsifier"),
         progress=context.progress,
     )
+    for line in made.coverage.lines():
+        context.progress.say(line)
     record = Library(
         tubes=tubes_record(made.certified),
         loop=loop_record(problem, tracker),
@@ -88,6 +100,9 @@ def run(context: StageContext) -> Path:
         reason_counts=np.array(made.counts, dtype=np.int64),
         sampled=made.sampled,
         wanted=section.size,
+        mode=made.modes,
+        mode_names=made.coverage.names,
+        mode_drawn=np.array(made.coverage.drawn, dtype=np.int64),
     )
     return context.write("build-library", record, (planner_file, tracker_file, *robot_files))
 

@@ -192,6 +192,7 @@ def kept_library(record: Library, scene: Scene, found: Assessment) -> Library:
     return dataclasses.replace(
         record,
         tubes=selected(_judged(tubes, scene, found), np.flatnonzero(safe)),
+        mode=tuple(mode for mode, kept in zip(record.mode, safe, strict=True) if kept),
         rejected_references=np.concatenate([record.rejected_references, tubes.references[lost]]),
         rejected_reason=(*record.rejected_reason, *reasons),
         reason_names=names,

@@ -322,6 +322,11 @@ class Library:
     reason_counts: np.ndarray = array("reasons", "how often each occurred", dtype="int64")
     sampled: int = scalar("references sampled altogether")
     wanted: int = scalar("certified references asked for, C")
+    mode: tuple[str, ...] = texts("count", "side on which each reference passes each obstacle, e.g. 'LR'")
+    mode_names: tuple[str, ...] = texts("modes", "modes that the planner proposed, the most often proposed first")
+    mode_drawn: np.ndarray = array(
+        "modes", "how often each was proposed, of references that are safe by themselves", dtype="int64"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -406,7 +411,7 @@ KINDS = (
     Kind("planner", 1, PlannerModel),
     Kind("tracker", 1, TrackerModel),
     Kind("certificate", 4, Certificate, oldest=4, command="sagemp verify --overwrite"),
-    Kind("library", 4, Library, oldest=4, command="sagemp build-library --overwrite"),
+    Kind("library", 5, Library, oldest=5, command="sagemp build-library --overwrite"),
     Kind("rollouts", 2, Rollouts, oldest=2, command="sagemp execute --overwrite"),
     Kind("safety", 2, SafetyRates, oldest=2, command="sagemp safety-rates --overwrite"),
 )

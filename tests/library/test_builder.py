@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sagemp_cli.errors import ConfigError
-from sagemp_cli.library import REASONS, build_library
+from sagemp_cli.library import REASONS, Fill, build_library
 from sagemp_cli.library.builder import NothingCertifiedError, reference_faults
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
@@ -108,6 +108,7 @@ def test_every_reason_is_counted_and_named():
         "tube in collision": 1,
         "tube misses goal": 1,
         "tube unbounded": 1,
+        "duplicate of an entry": 0,
     }
     assert made.sampled == 7
 
@@ -174,3 +175,64 @@ def test_selecting_and_joining_verifications_is_lossless():
         else:
             assert a == b, field.name
     assert verification.safe == [0, 2, 3]
+
+
+def beside(height, tag):
+    """A plan that passes the disc at (2, 2) below (the goal is below too) or, over its top, above."""
+    path = plan(GOOD, tag)
+    path[1:-1, 1] = height
+    return path
+
+
+BELOW, ABOVE = [beside(0.1 * i, i) for i in range(8)], [beside(3.0 + 0.1 * i, -1 - i) for i in range(8)]
+
+
+def filled(plans, outcomes=None, *, wanted, batch=4, **options):
+    """A library of these plans, and the numbers of its entries."""
+    source = Source([GOOD])
+    source.plans = torch.stack(plans)
+    arguments = {"scene": SCENE, "position": POSITION, "budget": len(plans), "batch": batch}
+    made = build_library(source, verifier(outcomes or {}), wanted=wanted, **arguments, **options)
+    return made, tags(made.certified.references)
+
+
+def test_an_entry_that_repeats_another_is_not_taken():
+    plans = [beside(0.1, 0), beside(0.1005, 1), beside(0.3, 2), beside(0.1005, 3)]
+    made, found = filled(plans, wanted=4, batch=3, apart=0.01)
+    assert found == [0, 2]
+    assert tags(made.rejected) == [1, 3] and set(made.reasons) == {"duplicate of an entry"}
+    assert filled(plans, wanted=4)[1] == [0, 1, 2, 3]
+
+
+def test_references_that_agree_at_some_steps_only_do_not_repeat_each_other():
+    assert filled([beside(0.1, 0), beside(0.2, 1)], wanted=2, apart=0.05)[1] == [0, 1]
+
+
+def test_the_modes_of_entries_and_of_proposals_are_counted():
+    made, found = filled([*BELOW[:4], ABOVE[0]], {-1: Outcome.MAY_COLLIDE}, wanted=3)
+    assert found == [0, 1, 2] and made.modes == ("R", "R", "R")
+    assert (made.coverage.names, made.coverage.drawn, made.coverage.held) == (("R",), (4,), (3,))
+    made, _ = filled([*BELOW[:4], ABOVE[0], BELOW[5]], {-1: Outcome.MAY_COLLIDE}, wanted=5)
+    assert made.coverage.missing == ("L",)
+    assert made.coverage.lines()[0] == "modes: R 5 (planner 83%), L 0 (planner 17%)"
+    assert "holds none of L" in made.coverage.lines()[1]
+
+
+def test_filled_by_modes_each_has_its_even_share():
+    plans = [*BELOW[:6], *ABOVE[:2], *BELOW[6:], *ABOVE[2:]]
+    assert filled(plans, wanted=4)[1] == [0, 1, 2, 3]
+    made, found = filled(plans, wanted=6, fill=Fill.MODES)
+    assert sorted(made.modes) == ["L"] * 2 + ["R"] * 4  # before the second mode was seen the first had filled up
+    made, found = filled([BELOW[0], ABOVE[0], *BELOW[1:], *ABOVE[1:]], wanted=6, fill=Fill.MODES)
+    assert sorted(made.modes) == ["L"] * 3 + ["R"] * 3 and made.coverage.missing == ()
+
+
+def test_what_was_set_aside_fills_the_library_when_the_budget_is_over():
+    made, found = filled([BELOW[0], ABOVE[0], *BELOW[1:]], wanted=6, fill=Fill.MODES)
+    assert len(found) == 6 and made.modes.count("L") == 1
+
+
+def test_a_mode_that_never_certifies_takes_nobodys_place():
+    outcomes = {-1 - i: Outcome.MAY_COLLIDE for i in range(8)}
+    made, found = filled([BELOW[0], ABOVE[0], *BELOW[1:], ABOVE[1]], outcomes, wanted=6, fill=Fill.MODES)
+    assert len(found) == 6 and set(made.modes) == {"R"} and made.coverage.missing == ("L",)
