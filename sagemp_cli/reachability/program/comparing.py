@@ -16,7 +16,7 @@ from torch import Tensor
 from sagemp_cli.errors import UsageError
 from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.program.kinds import FLOAT32
-from sagemp_cli.reachability.program.probing import TOLERANCE, Step
+from sagemp_cli.reachability.program.probing import IN_FLOAT32, TOLERANCE, Step
 from sagemp_cli.reachability.program.program import Instruction, Program
 from sagemp_cli.sets import Box
 
@@ -25,9 +25,6 @@ ROUNDINGS = 16
 
 MOST_POINTS = {True: 4096, False: 256}
 """Points at most in one comparison: of steps that take batches, of steps that take single states."""
-
-_CLOSE_IN_FLOAT32 = 1e-4
-"""The relative tolerance where an interval is infinite, of steps that compute in float32."""
 
 _KINKS, _STARTS, _NEWTON = 32, 4, 4
 _AROUND = (0.0, 1e-3, -1e-3, 0.1, -0.1, 1.0, -1.0)
@@ -73,7 +70,7 @@ def compare(
         loose = ~torch.isfinite(slack)
         if bool(loose.any()):
             plain = program.run(x, w, own).next.expand(after.shape)
-            close = _CLOSE_IN_FLOAT32 if any(kind in FLOAT32 for kind in program.kinds) else TOLERANCE
+            close = IN_FLOAT32 if any(kind in FLOAT32 for kind in program.kinds) else TOLERANCE
             off = torch.where(loose, ~((after - plain).abs() <= close * (1.0 + after.abs())), off)
     if bool(off.any()):
         row, i = torch.nonzero(off)[0].tolist()

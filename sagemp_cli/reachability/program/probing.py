@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.overrides import get_default_nowrap_functions
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
+from sagemp_cli.reachability.program.float32 import contains
 from sagemp_cli.reachability.program.loops import RecordedLoop, check_state, record, recorded_steps
 from sagemp_cli.reachability.program.memory import widened
 from sagemp_cli.reachability.program.value import UFUNCS, Traced
@@ -32,11 +33,19 @@ TOLERANCE = 1e-9
 """How far two float64 evaluations of the same formulas may differ, relative to 1 plus the size of the result."""
 
 
+IN_FLOAT32 = 1e-4
+"""The same of steps that compute in float32, where a batch is summed in another order than a single state."""
+
+_ROUNDED = [False]  # whether a step has computed in float32 since it was asked
+
 _NOT_WRAPPED = get_default_nowrap_functions()
 
 
 class _Exact(Tensor):
-    """float64 tensors that meet float32 constants as the exact numbers those are, where torch would refuse or round."""
+    """float64 tensors that meet float32 constants as the exact numbers those are, where torch would refuse or round.
+
+    What ``.float()`` makes of them is float32, and computed by torch as it is.
+    """
 
     __deepcopy__ = lambda self, memo: self.clone()  # noqa: E731
 
@@ -50,8 +59,12 @@ class _Exact(Tensor):
     @classmethod
     def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
         with torch._C.DisableTorchFunctionSubclass():
-            args = widened(tuple(args))
-            kwargs = {key: widened(value) for key, value in (kwargs or {}).items()}
+            kwargs = kwargs or {}
+            if contains((args, kwargs), cls, float32=True):
+                _ROUNDED[0] = True
+            else:
+                args = widened(tuple(args))
+                kwargs = {key: widened(value) for key, value in kwargs.items()}
             if types == (cls,):  # what torch itself does then, without its detours
                 result = function(*args, **kwargs)
                 return result if function in _NOT_WRAPPED else cls._wrapped(result)
@@ -154,6 +167,7 @@ def probe(function: Callable[[int, Any, Any], Any], start: Box, disturbance: Box
         UsageError: neither way gives states; or both do, but differ; or two calls with the same arguments differ.
         NonFiniteError: NaN or infinity at a state of the start box.
     """
+    _ROUNDED[0] = False
     generator = torch.Generator().manual_seed(0)
     count = start.dim + disturbance.dim + 2  # unlike n, so that rows and columns cannot be taken for each other
     xs, ws = start.sample(count, generator), disturbance.sample(count, generator)
@@ -270,7 +284,8 @@ def _same_on_plain_tensors(
 
 def agree(a: Tensor, b: Tensor) -> bool:
     """Whether two float64 evaluations agree up to rounding."""
-    return a.shape == b.shape and bool(((a - b).abs() <= TOLERANCE * (1.0 + b.abs())).all())
+    close = IN_FLOAT32 if _ROUNDED[0] else TOLERANCE
+    return a.shape == b.shape and bool(((a - b).abs() <= close * (1.0 + b.abs())).all())
 
 
 def _tried(step: Step, xs: Tensor, ws: Tensor) -> tuple[Tensor | None, SagempError]:

@@ -221,6 +221,11 @@ def test_lirpa_refuses_float32():
         reach(looped(layers()), Box.around([0.0, 0.0, 0.0], [0.1, 0.1, 0.1]), horizon=1, propagator=AutoLirpa())
 
 
+def test_limits_beside_float32_values_are_float32():
+    tube = reach(lambda x: x.float().clamp(-0.1, 0.1).double(), Box.around([0.1], [0.1]), horizon=1)
+    assert tube.upper[1, 0] == float(np.float32(0.1)) != 0.1
+
+
 def test_comparisons_and_choices_of_float32_values():
     def step(x):
         h = x.float() * 2.0
