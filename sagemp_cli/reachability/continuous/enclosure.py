@@ -19,11 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.continuous.expansion import Expansion
-from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
+from sagemp_cli.reachability.interval.form import IntervalForm, evaluate_arrays, run_on_arrays
 from sagemp_cli.reachability.program.program import Instruction, Outputs, Program
 from sagemp_cli.reachability.relaxations.sawtooth import within_a_period
 from sagemp_cli.sets import Box, round_down, round_up
@@ -85,8 +86,7 @@ def enclosure(
         reach = round_up(held.weight * held.jump)
         signal = Box(round_down(w.lower - reach), round_up(w.upper + reach))
     flowed = _Flowed(programs, state, control, w, signal, held)
-    stay = _a_priori(state, flowed)
-    inside = flowed(stay)  # as an image it is no larger than what it was found in
+    stay, inside = _a_priori(state, flowed)
     n, h, p = state.lower.shape[-1], programs.length, programs.division.order
     given = IntervalForm(signal.lower, signal.upper)
     found = _watched(programs.coefficients, inside, given, control)
@@ -135,7 +135,7 @@ def run_smoothly(
     An angle or a remainder may jump where its values are bounded all the same, and whatever is made of it then may be
     bounded too: so it is the operation that tells, and not the result.
     """
-    smooth = torch.ones(state.lower.shape[:-1], dtype=torch.bool)
+    smooth = np.ones(state.lower.shape[:-1], dtype=bool)
 
     def noted(i: Instruction, operands: Sequence[IntervalForm]) -> IntervalForm:
         nonlocal smooth
@@ -143,10 +143,12 @@ def run_smoothly(
             y, x = operands
             smooth = smooth & ((x.lower > 0) | (y.lower > 0) | (y.upper < 0)).all(-1)
         elif i.kind in ("remainder", "fmod", "wrap"):
-            smooth = smooth & within_a_period(i.kind, *operands[0].bounds, *map(float, i.constants)).all(-1)
-        return evaluate(i, operands)
+            low, high = (torch.from_numpy(np.ascontiguousarray(side)) for side in operands[0].bounds)
+            smooth = smooth & within_a_period(i.kind, low, high, *map(float, i.constants)).all(-1).numpy()
+        return evaluate_arrays(i, operands)
 
-    return program.run(state, w, numbers, evaluate=noted), smooth
+    found = run_on_arrays(program, state, w, numbers, evaluate=noted)
+    return found, torch.from_numpy(np.ascontiguousarray(smooth))
 
 
 def _number(bound: Tensor) -> Tensor:
@@ -162,7 +164,7 @@ def _times(a: IntervalForm, least: float, most: float) -> tuple[Tensor, Tensor]:
 
 def _watched(program: Program, state: IntervalForm, w: IntervalForm, numbers: IntervalForm | None) -> IntervalForm:
     """Of a program, the output ``control``, for all N parts."""
-    found = program.run(state, w, numbers, evaluate=evaluate).control
+    found = run_on_arrays(program, state, w, numbers).control
     batch = torch.broadcast_shapes(found.lower.shape[:-1], state.lower.shape[:-1])
     return IntervalForm(*(side.expand(*batch, -1) for side in found.bounds))
 
@@ -203,8 +205,10 @@ def rate_over(
     return low, torch.where(smooth, round_up(rate.upper + w.upper), torch.inf)
 
 
-def _a_priori(state: IntervalForm, flowed: _Flowed) -> IntervalForm:
-    """A box that no solution leaves within the part, ``(N, n)``; infinite where none was found."""
+def _a_priori(state: IntervalForm, flowed: _Flowed) -> tuple[IntervalForm, IntervalForm]:
+    """A box that no solution leaves within the part, ``(N, n)``, and its image, which is no larger; infinite where none
+    was found.
+    """
     trial = _widened(state, flowed(state))
     kept = torch.zeros(state.lower.shape[:-1], dtype=torch.bool)
     for _ in range(_ROUNDS):
@@ -212,13 +216,14 @@ def _a_priori(state: IntervalForm, flowed: _Flowed) -> IntervalForm:
         kept = ((trial.lower <= after.lower) & (after.upper <= trial.upper)).all(-1)
         kept &= torch.isfinite(trial.lower).all(-1) & torch.isfinite(trial.upper).all(-1)
         if bool(kept.all()):
-            return trial
+            return trial, after
         wider, fixed = _widened(state, after), kept[..., None]
         trial = IntervalForm(torch.where(fixed, trial.lower, wider.lower), torch.where(fixed, trial.upper, wider.upper))
     lost = torch.full_like(state.lower, torch.inf)
-    return IntervalForm(
+    stay = IntervalForm(
         torch.where(kept[..., None], trial.lower, -lost), torch.where(kept[..., None], trial.upper, lost)
     )
+    return stay, flowed(stay)
 
 
 def _widened(state: IntervalForm, after: IntervalForm) -> IntervalForm:
