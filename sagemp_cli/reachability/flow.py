@@ -95,8 +95,9 @@ class Flow:
         ]
         parts = self.division.substeps
         swing = round_up(2 * period / parts * w.radius).expand(self.lower.shape[1], -1).repeat_interleave(parts, 0)
-        if bool((self.jump > 0).any()):
-            swing = round_up(swing + round_up(period / parts * self.jump.flatten(1, 2)))
+        if bool((self.jump != 0).any()):
+            jump = torch.where(self.jump >= 0, self.jump, torch.inf)  # NaN too bounds nothing
+            swing = round_up(swing + round_up(period / parts * jump.flatten(1, 2)))
         rest = round_up(2 * self.drift.flatten(1, 2))
         return Tube(*ends), Bulge(self.curve.flatten(1, 2), swing, rest)
 

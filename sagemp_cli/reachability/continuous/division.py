@@ -7,15 +7,14 @@ beside the width of the tube says whether more parts would help: halving a part 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from sagemp_cli.reachability.continuous.reach import MOST_SUBSTEPS, reach_continuously
-from sagemp_cli.reachability.continuous.sampled import SampledLoop
-from sagemp_cli.reachability.flow import Division
-from sagemp_cli.reachability.propagator import Propagator, Reach
-from sagemp_cli.sets import Box
+from sagemp_cli.reachability.flow import Division, Flow
+from sagemp_cli.reachability.propagator import Reach
 
 ENOUGH = 0.05
 """Share of the tube's width that the remainders of a period may have, to begin with."""
@@ -26,9 +25,8 @@ FINE = 0.002
 _PROGRESS = 0.8
 """Share of the periods without enclosure that may be left by a finer division, for it to go on."""
 
-TRIED = 4
-"""Periods of a trial."""
-
+MOST_SUBSTEPS = 32
+"""Parts of a period at most, where the number is not asked for."""
 
 FLOOR = 0.01
 """A tube that is narrower than this share of how far it goes counts as that wide, before anything says otherwise."""
@@ -74,27 +72,56 @@ def finer(division: Division, substeps: int | None, order: int | None) -> Divisi
     return None
 
 
-def suggested(
-    propagator: Propagator, loop: SampledLoop, cells: Box, w: Box, *, substeps: int | None, order: int | None
-) -> Division:
-    """A division to begin with, by trials on the first periods of cells ``(C, n)``; what is given stays."""
-    first = loop.beginning(min(TRIED, loop.horizon))
-    division: Division | None = Division(substeps or 1, order or ORDERS[0])
-    best, least, lost = division, torch.inf, math.inf
+class Tried(Protocol):
+    """What a division gave."""
+
+    @property
+    def flow(self) -> Flow | None:
+        """What was proved between the instants."""
+        ...
+
+
+T = TypeVar("T", bound=Tried)
+
+
+def chosen(
+    tried: Callable[[Division], T],
+    begin: Division,
+    *,
+    substeps: int | None,
+    order: int | None,
+    share: Callable[[T], float] | None = None,
+) -> tuple[Division, T]:
+    """The best of finer and finer divisions, and what it gave: of as many as leave a good deal fewer periods without an
+    enclosure or too large a share to remainders.
+
+    Args:
+        tried: what a division gives.
+        begin: the first.
+        substeps, order: None where it may be changed.
+        share: of remainders in what a division gave, which may be :data:`ENOUGH`; None where it does not matter, if
+            only every period has an enclosure.
+    """
+    division: Division | None = begin
+    best: tuple[Division, T] | None = None
+    least, lost = math.inf, math.inf
     while division is not None:
-        found = reach_continuously(propagator, first, cells, w, substeps=division.substeps, order=division.order)
-        share, now = float(remainder_share(found, FLOOR).amax()), periods_lost(found)
-        if share < least or now < lost:
-            best, least = division, share
-        if share <= ENOUGH or (0 < now < first.horizon and now > _PROGRESS * lost):
+        found = tried(division)
+        size, now = 0.0 if share is None else share(found), periods_lost(found)
+        if best is None or size < least or now < lost:
+            best, least = (division, found), size
+        assert found.flow is not None
+        in_vain = 0 < now < found.flow.lower.shape[1] and now > _PROGRESS * lost
+        if (size <= ENOUGH and (now == 0 or share is not None)) or in_vain:
             break
         division, lost = finer(division, substeps, order), min(now, lost)
+    assert best is not None
     return best
 
 
-def periods_lost(reach: Reach) -> int:
+def periods_lost(found: Tried) -> int:
     """Periods of which the worst cell has no enclosure."""
-    flow = reach.flow
+    flow = found.flow
     assert flow is not None
     known = torch.isfinite(flow.remainder_lower) & torch.isfinite(flow.remainder_upper)
     return int((~known.flatten(2).all(-1)).sum(1).amax())

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Iterator
 
 import torch
 
 from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous.division import ORDERS, chosen
 from sagemp_cli.reachability.continuous.expansion import expansion
 from sagemp_cli.reachability.continuous.propagation import FlowRun, propagated
 from sagemp_cli.reachability.continuous.sampled import Sampled, SampledLoop, sampled
@@ -20,13 +19,8 @@ from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.sets import Box
 
-ORDER = 2
+ORDER = ORDERS[0]
 """Degree of the Taylor polynomials where none is asked for."""
-MOST_SUBSTEPS = 32
-"""Parts of a period at most, where the number is not asked for."""
-
-_PROGRESS = 0.8
-"""Share of the periods without enclosure that may be left by twice as many parts, for it to go on."""
 
 
 def reach_continuously(
@@ -80,14 +74,11 @@ def reach_continuously(
         raise UsageError("of a control that lags the disturbance may change from period to period, not within one")
     if order < 1:
         raise UsageError(f"order must be at least 1, found {order}")
-    best: FlowRun | None = None
-    for parts in [substeps] if substeps else _doubling():
-        found = propagated(propagator, known, start, w, Division(parts, order), foresee=foresee)
-        left, before = _missing(found), math.inf if best is None else _missing(best)
-        best = found if left < before else best
-        if left == 0 or known.horizon - left > 0 and left > _PROGRESS * before:
-            break
-    assert best is not None
+
+    def tried(division: Division) -> FlowRun:
+        return propagated(propagator, known, start, w, division, foresee=foresee)
+
+    _, best = chosen(tried, Division(substeps or 1, order), substeps=substeps, order=order)
     halves = None if best.run.halving is None else best.run.halving.halves(known.horizon)
     if halves is not None:  # a control before that is part of the state is not a side of a cell
         halves = Halves(*(side[:, :n, :, :n] for side in (halves.shift, halves.narrowing)))
@@ -104,15 +95,6 @@ def polynomial_steps(loop: Sampled | SampledLoop, start: Box, w: Box) -> tuple[R
     nothing = torch.zeros_like(w.lower)
     sides = (torch.cat([side, side, nothing]) for side in (w.lower, w.upper))
     return RecordedLoop((step,), known.numbers, known.horizon), Box(*sides)
-
-
-def _missing(found: FlowRun) -> int:
-    """Periods that the worst cell has no enclosure of."""
-    return found.flow.lower.shape[1] - int(found.failed.amin())
-
-
-def _doubling() -> Iterator[int]:
-    return itertools.takewhile(lambda parts: parts <= MOST_SUBSTEPS, (2**i for i in itertools.count()))
 
 
 def _result(found: FlowRun, loop: SampledLoop) -> Reach:

@@ -22,15 +22,14 @@ from sagemp_cli.reachability.any_loop import cells_of
 from sagemp_cli.reachability.continuous.division import (
     ENOUGH,
     FINE,
-    TRIED,
     finer,
     periods_lost,
     remainder_share,
-    suggested,
 )
 from sagemp_cli.reachability.continuous.observed import ObservedOde
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.continuous.sampled import SampledLoop
+from sagemp_cli.reachability.continuous.trial import TRIED, suggested
 from sagemp_cli.reachability.flow import Division, Flow
 from sagemp_cli.reachability.halves import Halves
 from sagemp_cli.reachability.propagator import Propagator, Reach

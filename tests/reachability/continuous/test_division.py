@@ -3,9 +3,10 @@
 import torch
 
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.continuous.division import remainder_share, suggested
+from sagemp_cli.reachability.continuous.division import remainder_share
 from sagemp_cli.reachability.continuous.observed import observed_ode
 from sagemp_cli.reachability.continuous.reach import reach_continuously
+from sagemp_cli.reachability.continuous.trial import suggested
 from sagemp_cli.reachability.flow import Division
 from sagemp_cli.sets import Box
 

@@ -1,5 +1,6 @@
 """Tubes in continuous time enclose every solution at the instants and between them, whatever the signal of w."""
 
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,9 @@ from sagemp_cli.errors import UnsupportedOperationError, UsageError
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.continuous.reach import reach_continuously
 from sagemp_cli.reachability.crown.crown import Crown
-from sagemp_cli.sets import Box
+from sagemp_cli.scenes.scene import Scene
+from sagemp_cli.sets import Between, Box
+from sagemp_cli.verification.verdict import Outcome, assess
 
 
 class Loop:
@@ -135,6 +138,82 @@ def test_the_period_is_cut_until_an_enclosure_is_found():
     reach = reach_continuously(Affine(), Fast(), START, W)
     assert reach.flow is not None and reach.flow.division.substeps > 1
     assert bool(torch.isfinite(reach.tube.upper).all())
+
+
+@pytest.mark.parametrize(
+    ("rate", "lower", "upper"),
+    [
+        (lambda x: torch.sqrt(x), 0.0, 0.1),  # of any slope at 0: more than one solution starts there
+        (lambda x: -torch.sqrt(x), 0.001, 0.002),  # reaches it within the first period
+        (lambda x: 1 / x, -0.1, 0.1),
+        (lambda x: -1 / x, 0.05, 0.06),
+        (lambda x: torch.log(x), 0.0, 0.1),
+        (lambda x: torch.tan(x), 1.5, 1.6),
+        (lambda x: torch.exp(torch.exp(20 * x)), 0.5, 0.6),
+    ],
+)
+def test_a_rate_without_bounds_or_slope_where_the_state_may_be_ends_the_tube_there_and_says_so(rate, lower, upper):
+    class Rough(Loop):
+        state_dim = 1
+
+        def control_given(self, numbers, x):
+            return 0 * x
+
+        def rate(self, x, u):
+            return rate(x) + u
+
+    reach = reach_continuously(Affine(), Rough(), box([[lower]], [[upper]]), box([0.0], [0.0]), substeps=4)
+    assert math.isinf(float(reach.tube.upper[0, 1, 0])) and reach.tube.lower[0, 0, 0] == lower
+    (note,) = [note for note in reach.notes if "no box was found that the flow stays in" in note]
+    assert "period 0" in note and "\n" not in note
+
+
+def test_a_part_that_cannot_be_made_small_enough_ends_the_tube_and_says_how_small_it_was():
+    class Stiff(Loop):
+        def rate(self, x, u):
+            return -1e5 * x + u
+
+    reach = reach_continuously(Affine(), Stiff(), START, W)
+    assert not bool(torch.isfinite(reach.tube.upper[:, -1]).any())
+    assert any("no box was found" in note and "0.1 s" in note for note in reach.notes)
+
+
+@pytest.mark.parametrize("period", [0.0, -0.1, math.nan, math.inf])
+def test_a_period_that_is_none_is_refused(period):
+    class Still(Loop):
+        pass
+
+    Still.period = period
+    with pytest.raises(UsageError, match="the period must be a positive number of seconds"):
+        reach_continuously(Affine(), Still(), START, W)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
+@pytest.mark.parametrize("side", ["curve", "drift", "jump", "state_lower", "state_upper"])
+def test_what_is_no_bound_between_the_instants_leaves_them_unbounded(side, value):
+    found = reach_continuously(Affine(), Loop(), START, W, substeps=2)
+    sound = assessed(found, found.flow)
+    assert str(sound.verdicts[0]) == "SAFE"
+    if side.startswith("state") and value == -1.0:
+        return
+    spoilt = getattr(found.flow, side).clone()
+    spoilt[1, 3, 1, 0] = value
+    verdict = assessed(found, dataclasses.replace(found.flow, **{side: spoilt})).verdicts[0]
+    assert verdict.outcome is Outcome.UNBOUNDED and verdict.step == 4
+
+
+def assessed(found, flow):
+    free = Box(torch.tensor([-math.inf] * 2), torch.tensor([math.inf] * 2))
+    scene = Scene(Box(torch.tensor([-9.0]), torch.tensor([9.0])), (), free)
+    return assess(
+        found.tube,
+        scene,
+        cell_reference=torch.zeros(2, dtype=torch.int64),
+        position=[0],
+        state_names=("angle", "rate"),
+        between=Between.CONTINUOUS,
+        lines=flow.lines(found.tube, W, Loop.period),
+    )
 
 
 def test_propagators_without_continuous_time_are_refused():
