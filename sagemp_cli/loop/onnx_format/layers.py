@@ -31,8 +31,26 @@ FUNCTIONS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "elu": (0, nn.functional.elu),
     "softplus": (0, lambda a: nn.functional.softplus(a, 1.0, SOFTPLUS_THRESHOLD)),
     "clamp": (2, torch.clamp),
+    "elu_of": (1, lambda a, alpha: nn.functional.elu(a, alpha)),
+    "gelu": (0, nn.functional.gelu),
+    "gelu_tanh": (0, lambda a: nn.functional.gelu(a, approximate="tanh")),
+    "mish": (0, nn.functional.mish),
+    "hardswish": (0, nn.functional.hardswish),
+    "softsign": (0, nn.functional.softsign),
+    "erf": (0, torch.erf),
+    "exp": (0, torch.exp),
+    "sqrt": (0, torch.sqrt),
+    "abs": (0, torch.abs),
+    "neg": (0, torch.neg),
+    "sin": (0, torch.sin),
+    "cos": (0, torch.cos),
+    "floor": (0, torch.floor),
+    "ceil": (0, torch.ceil),
+    "round": (0, torch.round),
+    "sign": (0, torch.sign),
+    "softmax": (0, lambda a: torch.softmax(a, -1)),
 }
-"""Of one vector, entry by entry: how many numbers it has of its own, and what it does."""
+"""Of one vector, entry by entry or (softmax) as a whole: how many numbers it has of its own, and what it does."""
 
 OPERATORS: Mapping[str, Callable[[Any, Any], Any]] = {
     "add": torch.add,
@@ -51,7 +69,8 @@ class Layer:
         kind: ``linear``, ``constant``, ``pick``, or one of :data:`FUNCTIONS` and :data:`OPERATORS`.
         size: entries of the result.
         reads: which vectors: 0 is the network's input, i the result of layer i - 1.
-        numbers: slope of a leaky ReLU, limits of a clamp (infinite where there is none).
+        numbers: slope of a leaky ReLU, alpha of an ELU that has another than 1, limits of a clamp (infinite where there
+            is none).
         entries: which are picked.
     """
 
@@ -188,4 +207,6 @@ def _check(layer: Layer, sizes: Sequence[int], where: str) -> None:
     elif layer.entries or (layer.kind not in ("linear", "constant") and set(read) != {layer.size}):
         raise ConfigError(f"{where}: {layer.kind} makes {layer.size} entries of {read}")
     if any(math.isnan(n) for n in layer.numbers) or (layer.kind == "leaky_relu" and not -1 <= layer.numbers[0] <= 1):
+        raise ConfigError(f"{where}: {layer.kind} cannot have {list(layer.numbers)}")
+    if layer.kind == "elu_of" and not 0 < layer.numbers[0] < math.inf:
         raise ConfigError(f"{where}: {layer.kind} cannot have {list(layer.numbers)}")

@@ -258,7 +258,19 @@ class _Lowering:
             if not -1 <= numbers[0] <= 1:
                 raise _RefusedError(f"has a 'LeakyRelu' with slope {numbers[0]}, supported is -1 to 1")
         if op == "Elu" and attributes.get("alpha", 1.0) != 1.0:
-            raise _RefusedError(f"has an 'Elu' with alpha {attributes['alpha']}, supported is 1")
+            numbers = (float(attributes["alpha"]),)
+            if not numbers[0] > 0:
+                raise _RefusedError(f"has an 'Elu' with alpha {numbers[0]}, supported is a positive one")
+        if op == "Gelu" and attributes.get("approximate", "none") not in ("none", "tanh"):
+            raise _RefusedError(
+                f"has a 'Gelu' with approximate '{attributes['approximate']}', supported are none and tanh"
+            )
+        if op == "Softmax":
+            axis = attributes.get("axis", -1 if self.graph["opset"] >= 13 else 1)
+            if not -len(vector.shape) <= axis < len(vector.shape) or vector.shape[axis] != math.prod(vector.shape):
+                raise _RefusedError(
+                    f"has a 'Softmax' along axis {axis} of shape {list(vector.shape)}; it must be over all entries"
+                )
         if op == "Clip":
             numbers = tuple(
                 _limit(attributes.get(key), operands[i] if len(operands) > i else None, none)
@@ -270,6 +282,10 @@ class _Lowering:
                 raise _RefusedError("has a 'PRelu' whose slope is not one constant of -1 to 1")
             numbers = (float(slopes[0]),)
         kind = {"LeakyRelu": "leaky_relu", "PRelu": "leaky_relu", "Clip": "clamp"}.get(op, op.lower())
+        if op == "Gelu" and attributes.get("approximate", "none") == "tanh":
+            kind = "gelu_tanh"
+        if op == "Elu" and numbers:
+            kind = "elu_of"
         size = math.prod(vector.shape)
         return self._layer(Layer(kind, size, (vector.index,), numbers), vector.shape)
 
@@ -393,6 +409,27 @@ _OPS: Mapping[str, tuple[int, int, tuple[str, ...], _Make]] = {
     "Sigmoid": (1, 1, (), _Lowering.function),
     "Elu": (1, 1, ("alpha",), _Lowering.function),
     "Softplus": (1, 1, (), _Lowering.function),
+    "Gelu": (1, 1, ("approximate",), _Lowering.function),
+    "Softmax": (1, 1, ("axis",), _Lowering.function),
+    **dict.fromkeys(
+        (
+            "Mish",
+            "HardSwish",
+            "Softsign",
+            "Erf",
+            "Exp",
+            "Sqrt",
+            "Abs",
+            "Neg",
+            "Sin",
+            "Cos",
+            "Floor",
+            "Ceil",
+            "Round",
+            "Sign",
+        ),
+        (1, 1, (), _Lowering.function),
+    ),
     "Clip": (1, 3, ("min", "max"), _Lowering.function),
     "Flatten": (1, 1, ("axis",), _Lowering.shaped),
     "Reshape": (1, 2, ("shape", "allowzero"), _Lowering.shaped),

@@ -27,6 +27,9 @@ OPSET = 17
 IR_VERSION = 8
 """Old enough for the runtimes that are out there."""
 
+NEWER = {"mish": 18, "gelu": 20, "gelu_tanh": 20}
+"""Layers that need a later version of the operators, and which; with it the version of the format is 9."""
+
 
 def write_onnx(tracker: Controller, path: Path, *, float32: bool = False, overwrite: bool = False) -> None:
     """Write a tracker's network as an ONNX file with one input, ``(batch, entries)``, and one output, ``(batch, m)``.
@@ -46,12 +49,13 @@ def write_onnx(tracker: Controller, path: Path, *, float32: bool = False, overwr
     except ImportError:
         raise UsageError("writing ONNX needs the package 'onnx': pip install 'sagemp[onnx]'") from None
     network = as_network(tracker)
+    opset = max([OPSET, *(NEWER.get(layer.kind, 0) for layer in network.layers)])
     graph = _Graph(network, np.float32 if float32 else np.float64, onnx).made(type(tracker).__name__)
     model = onnx.helper.make_model(
         graph,
         producer_name="sagemp",
-        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
+        opset_imports=[onnx.helper.make_opsetid("", opset)],
+        ir_version=IR_VERSION if opset == OPSET else 9,
     )
     onnx.checker.check_model(model)
     write_whole(path, model.SerializeToString(), overwrite=overwrite)
@@ -142,7 +146,10 @@ class _Layers:
         self.add(Layer(kind, size, (before, self.last)))
 
 
-_NODES = {"relu": "Relu", "tanh": "Tanh", "sigmoid": "Sigmoid", "softplus": "Softplus", "elu": "Elu"}
+_NODES = {"relu": "Relu", "tanh": "Tanh", "sigmoid": "Sigmoid", "softplus": "Softplus", "elu": "Elu", "mish": "Mish",
+          "gelu": "Gelu", "hardswish": "HardSwish", "softsign": "Softsign", "erf": "Erf", "exp": "Exp", "sqrt": "Sqrt",
+          "abs": "Abs", "neg": "Neg", "sin": "Sin", "cos": "Cos", "floor": "Floor", "ceil": "Ceil", "round": "Round",
+          "sign": "Sign", "softmax": "Softmax"}  # fmt: skip
 _OPERATORS = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div"}
 
 
@@ -185,6 +192,13 @@ class _Graph:
                     self._node("LeakyRelu", reads, result, alpha=slope)
                 else:  # whose slope may be any float64, an attribute is float32
                     self._node("PRelu", [*reads, self._constant(f"slope{i}", np.array([slope]))], result)
+            case "gelu_tanh":
+                self._node("Gelu", reads, result, approximate="tanh")
+            case "elu_of":
+                alpha = layer.numbers[0]
+                if self._kind is not np.float32 and float(np.float32(alpha)) != alpha:
+                    raise ConfigError(f"an ELU of alpha {alpha} cannot be written exactly, an attribute is float32")
+                self._node("Elu", reads, result, alpha=alpha)
             case "clamp":
                 limits = [
                     self._constant(f"{which}{i}", np.array(value)) if math.isfinite(value) else ""

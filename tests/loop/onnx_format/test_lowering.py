@@ -98,6 +98,15 @@ def one_layer(op, rng):
         case "Clip above only":
             nodes = [*middle, node("Clip", ["h", "", "hi"], ["y"])]
             return nodes, {"w": w, "b": b, "hi": np.float32(0.3)}, plain
+        case "Gelu" | "Mish" | "HardSwish":
+            return [*middle, node(op, ["h"], ["y"])], {"w": w, "b": b}, plain | {"opset": 20}
+        case "Gelu in its tanh form":
+            nodes = [*middle, node("Gelu", ["h"], ["y"], approximate="tanh")]
+            return nodes, {"w": w, "b": b}, plain | {"opset": 20}
+        case "Elu of another alpha":
+            return [*middle, node("Elu", ["h"], ["y"], alpha=0.5)], {"w": w, "b": b}, plain
+        case "Sqrt":
+            return [*middle, node("Exp", ["h"], ["e"]), node("Sqrt", ["e"], ["y"])], {"w": w, "b": b}, plain
         case "LeakyRelu":
             return [*middle, node("LeakyRelu", ["h"], ["y"], alpha=0.3)], {"w": w, "b": b}, plain
         case "LeakyRelu by default":
@@ -128,7 +137,8 @@ Sub, Conv, Flatten|Flatten at the front|Reshape|Reshape to more dimensions|Trans
 Cast and Identity|Constant
 Clip by attributes|Clip|Clip above only|LeakyRelu|LeakyRelu by default|PRelu|Add|Sub|Mul|Div|Sub from a constant
 Add a column|Add two values|Mul two values|Sub two values|Div two values|Mul by one of its entries
-Relu|Tanh|Sigmoid|Softplus|Elu""".replace("\n", "|").split("|")
+Relu|Tanh|Sigmoid|Softplus|Elu|Gelu|Mish|HardSwish|Softsign|Erf|Exp|Abs|Neg|Sin|Cos|Floor|Ceil|Round|Sign|Softmax
+Elu of another alpha|Gelu in its tanh form|Sqrt""".replace("\n", "|").split("|")
 
 
 @pytest.mark.parametrize("op", LAYERS)
@@ -196,7 +206,12 @@ def test_a_power_of_two_is_a_factor_of_any_weights(factor, saved):
 W = np.eye(3, dtype=np.float32)
 GEMM = node("Gemm", ["x", "w"], ["y"])
 REFUSED = {
-    "another operator": ([node("Sin", ["x"], ["y"])], {}, {}, "uses 'Sin', which is not supported; supported are Gemm"),
+    "another operator": (
+        [node("Asin", ["x"], ["y"])],
+        {},
+        {},
+        "uses 'Asin', which is not supported; supported are Gemm",
+    ),
     "recurrent": ([node("LSTM", ["x", "w", "w"], ["y"])], {"w": W}, {}, "uses 'LSTM'"),
     "another domain": (
         [onnx.helper.make_node("Relu", ["x"], ["y"], domain="com.microsoft")],
@@ -243,7 +258,13 @@ REFUSED = {
     ),
     "division by zero": ([node("Div", ["x", "w"], ["y"])], {"w": np.zeros(3, np.float32)}, {}, "'Div' by zero"),
     "a steep LeakyRelu": ([node("LeakyRelu", ["x"], ["y"], alpha=2.0)], {}, {}, "slope 2.0"),
-    "Elu of another alpha": ([node("Elu", ["x"], ["y"], alpha=2.0)], {}, {}, "alpha 2.0, supported is 1"),
+    "Elu below 0": ([node("Elu", ["x"], ["y"], alpha=-2.0)], {}, {}, "alpha -2.0, supported is a positive one"),
+    "Softmax of rows": (
+        [node("Softmax", ["x"], ["y"], axis=0)],
+        {},
+        {},
+        "along axis 0 of shape .* must be over all entries",
+    ),
     "slopes that differ": ([node("PRelu", ["x", "w"], ["y"])], {"w": np.float32([0.1, 0.2, 0.3])}, {}, "slope"),
     "NaN as a limit": ([node("Clip", ["x"], ["y"], min=float("nan"))], {}, {"opset": 10}, "clamp cannot have"),
     "arithmetic on constants": ([node("Add", ["w", "w"], ["y"])], {"w": W}, {}, "two constants"),

@@ -220,6 +220,21 @@ def test_a_foreign_network_of_every_kind_of_layer_survives_writing(saved, tmp_pa
     torch.testing.assert_close(again.network(errors), expected, rtol=1e-14, atol=1e-14)
 
 
+def test_activations_of_later_versions_survive_writing(saved, tmp_path):
+    kinds = ["Gelu", "Mish", "HardSwish", "Softsign", "Erf", "Exp", "Sqrt", "Neg", "Sin", "Abs", "Cos", "Softmax"]
+    names = ["x", *(f"h{i}" for i in range(len(kinds) + 1)), "y"]
+    nodes = [node(kind, [names[i]], [names[i + 1]]) for i, kind in enumerate(kinds)]
+    nodes.append(node("Gelu", [names[len(kinds)]], [names[len(kinds) + 1]], approximate="tanh"))
+    nodes.append(node("Elu", [names[-2]], ["y"], alpha=0.5))
+    path = str(saved(nodes, {}, shape=[1, 6], outputs=[1, 6], opset=20))
+    tracker = OnnxTracker.taken(state_dim=3, control_dim=6, path=path)
+    write_onnx(tracker, tmp_path / "again.onnx")
+    again = OnnxTracker.taken(state_dim=3, control_dim=6, path=str(tmp_path / "again.onnx"))
+    errors = torch.randn(50, 6, generator=torch.Generator().manual_seed(0)).double()
+    assert float(tracker.network(errors).std()) > 1e-4
+    torch.testing.assert_close(again.network(errors), tracker.network(errors), rtol=1e-14, atol=1e-14)
+
+
 def test_writing_never_replaces_a_file_unasked_and_refuses_numbers_beyond_float32(ours, tmp_path):
     path = tmp_path / "net.onnx"
     write_onnx(ours, path)
