@@ -12,6 +12,7 @@ from sagemp_cli.checker.cell import CellClaim, prove_cell
 from sagemp_cli.checker.loop import Folded
 from sagemp_cli.checker.program import Instruction, Program
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.affine.compiled import beside
 from sagemp_cli.reachability.program.loops import recorded
 from sagemp_cli.sets import Box
 
@@ -97,8 +98,10 @@ class Loop:
 
 
 @pytest.fixture(params=SQUASHED)
-def squashed(request):
-    """A claim whose proof rests on intervals, and the program."""
+def squashed(request, monkeypatch):
+    """A claim whose proof rests on intervals wherever they are tighter at all, and the program."""
+    for share in ("NOTICEABLE", "NOTICEABLE_AT_A_KINK"):
+        monkeypatch.setattr(beside, share, 1.0)
     with torch.no_grad():
         return claim(
             Loop(SQUASHED[request.param]), Box.around([0.1, -0.2], [0.8, 0.9]), Box.around([0.0] * 2, [0.02] * 2)
@@ -107,6 +110,13 @@ def squashed(request):
 
 def test_what_intervals_make_tighter_is_proved(squashed):
     assert proved(*squashed) == ""
+
+
+@pytest.mark.parametrize("name", SQUASHED)
+def test_what_intervals_make_noticeably_tighter_is_proved(name):
+    with torch.no_grad():
+        made = claim(Loop(SQUASHED[name]), Box.around([0.1, -0.2], [0.8, 0.9]), Box.around([0.0] * 2, [0.02] * 2))
+    assert proved(*made) == ""
 
 
 @pytest.mark.parametrize("end", ["tube_lower", "tube_upper"])

@@ -117,7 +117,7 @@ def test_forward_sets_count_the_generators_that_a_step_may_have(symbols, generat
     size = LoopSize(steps=500, states=4, disturbances=3, entries=20, widest=8)
     found = Affine(symbols=symbols).footprint(size)
     assert found.kept == 8 * (2 * 501 * 4 + 3 * 500 * 20 + 500 * generators / 64)
-    assert found.working == 8 * (6 * generators * 4 + 12 * 27**2 + 10 * 27 * 64) + 2 * found.kept
+    assert found.working == 8 * (6 * generators * 4 + 12 * 27**2 + 10 * 27 * 128) + 2 * found.kept
 
 
 @pytest.mark.parametrize(("symbols", "above"), [(30, 1.02), (None, 1.1)])

@@ -17,7 +17,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -26,8 +26,10 @@ from torch import Tensor
 from sagemp_cli.config.ranges import Count
 from sagemp_cli.errors import ConfigError, UsageError
 from sagemp_cli.reachability.affine.boxed import Boxed
+from sagemp_cli.reachability.affine.compiled.checked import Checked, Trace, checked
 from sagemp_cli.reachability.affine.compiled.hints import Hints
-from sagemp_cli.reachability.affine.compiled.run import BLOCK, Done, Steps
+from sagemp_cli.reachability.affine.compiled.intervals import within
+from sagemp_cli.reachability.affine.compiled.run import Done, Steps
 from sagemp_cli.reachability.affine.compiled.steps import KeptStep
 from sagemp_cli.reachability.affine.halving import Halving
 from sagemp_cli.reachability.batch import recorded_and_batched
@@ -41,6 +43,9 @@ from sagemp_cli.sets.zonotope import Zonotope
 
 MANY = 2**14
 """Numbers in the generators of all cells from which on it is looked for some to drop at every step."""
+SHORT, BLOCK = 8, 128
+"""Steps that are taken by forms alone before they are checked against intervals: after some for which they made a
+difference, and else, at most."""
 
 
 @dataclass(frozen=True)
@@ -166,25 +171,14 @@ class Affine(Propagator):
         sides = start.lower.reshape(-1, n), start.upper.reshape(-1, n)
         low, high = sides if differentiated else (side.numpy() for side in sides)
         steps = Steps(known, disturbance, batch, tensors=differentiated, watch=watch)
-        first = _Course(states, low, high, Boxed(self.symbols), halving)
+        course = _Course(states, low, high, Boxed(self.symbols), halving)
         count = loop.horizon if horizon is None else horizon
-        # A cell has intervals at all steps or at none, so that its tube is the same whatever cells are beside it.
-        carrying = np.zeros_like(steps.every_cell) if intervals and not differentiated else None
-        course, length = first.copy(), 1
-        while course.step < count:
-            begin, traces = course.step, []
-            for k in range(begin, min(begin + length, count)):
-                sets = course.states, (course.low, course.high)
-                done = steps.evaluate(k, *sets, None if hints is None else hints[k], carrying)
-                course.take(done, keep_steps=keep_steps, symbols=self.symbols)
-                traces.append(done.trace)
-            missed = steps.check(begin, traces, carrying)
-            if carrying is not None and missed.cells.any():
-                carrying = carrying | missed.cells
-                course, length = first.copy(), 1
-                continue
-            course.sharpen(missed.watched)
-            length = min(8 * length, BLOCK)
+        asked = _Asked(self.symbols, keep_steps, hints)
+        if intervals and not differentiated:
+            course = _beside_intervals(steps, course, count, asked, watch=watch)
+        else:
+            for k in range(count):
+                course.take(steps.kept(k, *course.sets, asked.hint(k)), asked)
         tube = Tube(
             *(
                 torch.cat([f[..., None, :], _in_batch(s, batch)], -2)
@@ -203,6 +197,46 @@ class Affine(Propagator):
             course.states,
             course.halving,
         )
+
+
+class _Asked(NamedTuple):
+    """What is asked of a pass: see :class:`Affine`."""
+
+    symbols: int | None
+    keep_steps: bool
+    hints: Sequence[Hints] | None
+
+    def hint(self, k: int) -> Hints | None:
+        """What is known of step k."""
+        return None if self.hints is None else self.hints[k]
+
+
+def _beside_intervals(steps: Steps, course: _Course, count: int, asked: _Asked, *, watch: bool) -> _Course:
+    """Take steps up to that one.
+
+    Every value has an interval beside its form, wherever that can make a difference. In the first step it often does,
+    and in the one after a step in which it did; there intervals are carried along. Other steps are taken many at once
+    without, and checked against intervals afterwards (:mod:`.affine.compiled.checked`).
+    """
+    beside, length = True, BLOCK
+    while course.step < count:
+        if beside:
+            done = steps.beside_intervals(course.step, *course.sets, asked.hint(course.step))
+            course.take(done, asked)
+            beside, length = done.used, SHORT if done.used else length
+            continue
+        before = course.copy()
+        traces = [course.traced(steps, asked)]
+        while len(traces) < length and course.step < count and not traces[-1].lost:
+            traces.append(course.traced(steps, asked))
+        found = checked(steps, before.step, traces, watch=watch)
+        if found.steps < len(traces):
+            course, beside = before, True
+            for _ in range(found.steps):
+                course.traced(steps, asked)
+        course.sharpen(found)
+        length = BLOCK
+    return course
 
 
 @dataclass
@@ -236,21 +270,33 @@ class _Course:
         """Which one is next."""
         return len(self.lows)
 
+    @property
+    def sets(self) -> tuple[Zonotope, tuple[Any, Any]]:
+        """The set that was reached, and its bounds."""
+        return self.states, (self.low, self.high)
+
     def copy(self) -> _Course:
         """One that does not change with this."""
         lists = {name: list(value) for name, value in vars(self).items() if isinstance(value, list)}
         halving = None if self.halving is None else self.halving.copy()
         return dataclasses.replace(self, boxed=copy.copy(self.boxed), halving=halving, **lists)
 
-    def take(self, done: Done, *, keep_steps: bool, symbols: int | None) -> None:
+    def traced(self, steps: Steps, asked: _Asked) -> Trace:
+        """Take the next step by forms alone; what is to be kept of it until it is checked."""
+        before, k = (self.low, self.high), self.step
+        done = steps.by_forms(k, self.states, asked.hint(k))
+        self.take(done, asked)
+        return Trace(before, done.operands, (self.low, self.high), done.lost is not None)
+
+    def take(self, done: Done, asked: _Asked) -> None:
         """A step."""
-        frame, after, states = done.frame, done.after, done.states
+        frame, after, states, symbols = done.frame, done.after, done.states, asked.symbols
         self.bands.append(
             [pair for r in frame.relaxed for pair in recorded_bands(r.name, r.band, r.turn, r.ratio, r.given)]
         )
         if done.watched is not None:
             self.controls.append(done.watched)
-        if keep_steps:
+        if asked.keep_steps:
             self.kept.append(KeptStep.of(frame, after))
         if self.halving is not None:
             self.halving.follow(frame, after)
@@ -276,11 +322,13 @@ class _Course:
         self.lows.append(self.low)
         self.highs.append(self.high)
 
-    def sharpen(self, controls: Sequence[tuple[Any, Any]]) -> None:
-        """Bounds of what is watched in the last steps, intersected with these."""
-        for i, (low, high) in enumerate(controls, start=len(self.controls) - len(controls)):
-            lower, upper = self.controls[i]
-            self.controls[i] = np.fmax(lower, low), np.fmin(upper, high)
+    def sharpen(self, found: Checked) -> None:
+        """What intervals know of the last steps."""
+        first = self.step - found.steps
+        for i, (low, high) in enumerate(found.rows, start=first):
+            self.lows[i], self.highs[i] = self.low, self.high = low, high
+        for i, watched in enumerate(found.watched, start=first):
+            self.controls[i] = within(self.controls[i], watched)
 
 
 def _in_batch(steps: Sequence[Any], batch: torch.Size) -> Tensor:

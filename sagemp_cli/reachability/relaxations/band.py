@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from sagemp_cli.reachability.relaxations.functions import functions_of
+from sagemp_cli.reachability.relaxations.functions import all_finite, functions_of
 
 
 class Band(NamedTuple):
@@ -28,7 +28,7 @@ def settled(slope: Tensor, offset: Tensor, radius: Tensor) -> Band:
     A relaxation's radius is not finite if the interval or anything computed from it is not, so the radius alone is
     asked: one sum in the usual case.
     """
-    if math.isfinite(radius.sum().item()):
+    if all_finite(radius):
         return Band(slope, offset, radius)
     m = functions_of(radius)
     finite = m.isfinite(radius)

@@ -39,7 +39,17 @@ def contiguous(x: Any) -> Any:
 
 def constant(x: Any) -> Any:
     """A context in which what is computed from x is a constant for autograd."""
-    return torch.no_grad() if isinstance(x, Tensor) else contextlib.nullcontext()
+    return torch.no_grad() if isinstance(x, Tensor) else _AS_IT_IS
+
+
+def all_finite(x: Any) -> bool:
+    """Whether the sum of all entries is finite: if it is, every entry is."""
+    if isinstance(x, Tensor):
+        return math.isfinite(x.sum().item())
+    return math.isfinite(np.add.reduce(x, axis=None))  # a method would take half as long again
+
+
+_AS_IT_IS = contextlib.nullcontext()
 
 
 class _Numpy:
@@ -58,7 +68,7 @@ class _Numpy:
 
     @staticmethod
     def nan_to_num(x: np.ndarray, **values: Any) -> np.ndarray:
-        return x if math.isfinite(x.sum()) else np.nan_to_num(x, **values)
+        return x if all_finite(x) else np.nan_to_num(x, **values)
 
     @staticmethod
     def broadcast_tensors(*arrays: Any) -> Any:

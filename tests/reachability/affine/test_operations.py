@@ -36,7 +36,7 @@ class Formed:
         if not tensors:
             state = Zonotope(state.center.numpy(), state.generators.numpy())
         with np.errstate(all="ignore"):
-            done = steps.evaluate(0, state, (state.low, state.high))
+            done = steps.kept(0, state, (state.low, state.high))
             self.frame, self.value = done.frame, done.form
             self.low, self.high = (torch.as_tensor(side) for side in self.frame.bounds(self.value))
             self.radius = torch.as_tensor(self.frame.reach(self.value))

@@ -2,15 +2,21 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from random_programs import escaped, random_problem, worst_rollouts
 
+from sagemp_cli.reachability.affine import affine
 from sagemp_cli.reachability.affine.affine import Affine
-from sagemp_cli.reachability.affine.compiled import intervals
+from sagemp_cli.reachability.affine.compiled import checked, intervals
+from sagemp_cli.reachability.affine.compiled.beside import noticeably
+from sagemp_cli.reachability.affine.compiled.folding import compiled
+from sagemp_cli.reachability.affine.compiled.run import Steps
 from sagemp_cli.reachability.crown.best import Best
 from sagemp_cli.reachability.crown.crown import Crown
 from sagemp_cli.reachability.interval.interval import Interval
+from sagemp_cli.reachability.program.loops import record
 from sagemp_cli.sets import Box
 
 from ..propagator_cases import DISTURBANCE, START, EveryOperation, line, rollouts, unicycle_loop
@@ -186,3 +192,53 @@ def test_cells_have_the_tubes_that_they_have_alone():
         alone = Affine().propagate(loop, Box(lower[c], upper[c]), NOTHING)
         torch.testing.assert_close(together.lower[c], alone.lower, rtol=1e-9, atol=1e-12)
         torch.testing.assert_close(together.upper[c], alone.upper, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("short, block", [(1, 1), (2, 5), (100, 100)])
+@pytest.mark.parametrize("seed", range(6))
+def test_how_many_steps_are_checked_at_once_makes_no_difference(seed, short, block, monkeypatch):
+    loop, start, disturbance = random_problem(seed)
+    tube = Affine().propagate(loop, start, disturbance)
+    monkeypatch.setattr(affine, "SHORT", short)
+    monkeypatch.setattr(affine, "BLOCK", block)
+    other = Affine().propagate(loop, start, disturbance)
+    torch.testing.assert_close(other.lower, tube.lower, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(other.upper, tube.upper, rtol=1e-9, atol=1e-12)
+
+
+def test_a_set_that_is_lost_between_two_checks_is_taken_again_beside_its_intervals():
+    """The root's form reaches below 0 at the fourth step, where its interval does not."""
+    loop = Step(lambda x, w: 0.5 * x - 0.05 + 0.02 * torch.sqrt(torch.relu(x - 0.01)) + w, horizon=10)
+    tube = Affine().propagate(loop, Box.around([1.0, 0.9], [0.1, 0.05]), NOTHING)
+    assert bool(torch.isfinite(tube.width).all()) and float(tube.width[-1].max()) < 0.05
+
+
+def test_intervals_are_carried_along_only_where_they_make_a_difference(monkeypatch):
+    taken = []
+    honest = Steps.beside_intervals
+    monkeypatch.setattr(Steps, "beside_intervals", lambda self, k, *rest: taken.append(k) or honest(self, k, *rest))
+    Affine().propagate(unicycle_loop(line(0.3), gain=2.0), START, DISTURBANCE)
+    assert len(taken) <= 3 and taken[0] == 0
+
+
+def test_steps_whose_operands_saturate_late_are_taken_again_beside_their_intervals(monkeypatch):
+    def relaxed_by():
+        loop = Step(lambda x, w: 1.2 * torch.clamp(torch.sin(2.0 * torch.clamp(x, -1.0, 1.0)), -0.6, 0.9), horizon=12)
+        run = Affine().run(loop, Box.around([0.02, 0.01], [0.03, 0.02]), NOTHING)
+        return sum(float(band.radius.sum()) for step in run.bands for _, band in step)
+
+    taken = []
+    honest = Steps.beside_intervals
+    monkeypatch.setattr(Steps, "beside_intervals", lambda self, k, *rest: taken.append(k) or honest(self, k, *rest))
+    found = relaxed_by()
+    assert taken[0] == 0 and max(taken) > 2 and 1 not in taken
+    monkeypatch.setattr(checked, "noticeably", lambda node, lower, *rest: np.zeros(len(lower), dtype=bool))
+    assert found < 0.9 * relaxed_by()
+
+
+def test_what_vanishes_is_not_noticeably_tighter():
+    node = compiled(record(lambda x, w: torch.sin(x), torch.zeros(1), torch.zeros(1))).nodes[0]
+    wide, none = np.array([[1.0], [1e-260], [0.0]]), np.zeros((3, 1))
+    assert noticeably(node, -wide, wide, none, none).tolist() == [True, False, False]
+    assert noticeably(node, -wide, wide, -0.6 * wide, 0.6 * wide).tolist() == [True, False, False]
+    assert noticeably(node, -wide, wide, -0.7 * wide, 0.7 * wide).tolist() == [False, False, False]

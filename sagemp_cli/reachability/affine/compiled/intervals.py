@@ -14,6 +14,7 @@ Rounding: see :class:`_Fold`; the functions' ranges include theirs.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +26,7 @@ from sagemp_cli.reachability.affine.compiled.folding import Combination, Compile
 from sagemp_cli.reachability.interval.form import IntervalForm, evaluate
 from sagemp_cli.reachability.program.program import Instruction
 from sagemp_cli.reachability.relaxations.float32 import error_of_sums, sizes_of_sums, widened
+from sagemp_cli.reachability.relaxations.functions import all_finite
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.rounding import SAFETY, TINY, combined
 
@@ -51,10 +53,15 @@ class Intervals:
         self.first = step.columns
         self.nodes, self.numbers = step.nodes, numbers.detach().numpy()
         self.disturbance = tuple(side.detach().numpy() for side in (disturbance.lower, disturbance.upper))
-        self.operands = [_Fold(node.operands) for node in step.nodes]
-        self.next = _Fold(step.outputs.next)
-        self.watched = None if step.watched is None else _Fold(step.watched)
-        self.squares = [_squares(node) for node in step.nodes]
+        self.operands, self.squares, self.next, self.watched = _ready(step)
+
+
+@functools.lru_cache(maxsize=8)
+def _ready(step: Compiled) -> tuple[list[_Fold], list[Array | None], _Fold, _Fold | None]:
+    """Of all operations the operands, and which are squares; the next state, and what is watched."""
+    watched = None if step.watched is None else _Fold(step.watched)
+    operands, squares = [_Fold(node.operands) for node in step.nodes], [_squares(node) for node in step.nodes]
+    return operands, squares, _Fold(step.outputs.next), watched
 
 
 class Carried:
@@ -92,17 +99,9 @@ class Carried:
         assert self._of.watched is not None
         return self._of.watched(self._ends)
 
-    def know(self, i: int, operands: Sides, form: Sides | None) -> None:
-        """The result of operation i.
-
-        Args:
-            i: its number.
-            operands: from :meth:`operand`.
-            form: what its form says of them besides, if anything; of a maximum of ``a - b`` only.
-        """
+    def know(self, i: int, operands: Sides) -> None:
+        """The result of operation i, from bounds of its operands."""
         node = self._of.nodes[i]
-        if form is not None and node.rule in ("function", "product"):
-            operands = _both(operands, form)
         if node.rule == "sums":
             found = _sums(node, operands)
         elif node.rule == "function":
@@ -117,7 +116,7 @@ class Carried:
         first, last = self._of.first[part : part + 2]
         ends = self._ends[0, :, :, first:last]
         ends[:, 0], ends[:, 1] = high, 0.0 - low
-        if not math.isfinite(ends.sum()):
+        if not all_finite(ends):
             ends[~np.isfinite(ends)] = math.inf
         np.abs(ends, out=self._ends[1, :, :, first:last])
 
@@ -145,17 +144,27 @@ class _Fold:
         twice = np.r_[copies, copies]
         self._error = np.where(twice, 0.0, (combination.error + combined(terms)) * SAFETY)
         self._tiny = np.where(twice, 0.0, TINY)
-        doubt = combination.error * SAFETY + 2.0**-1000  # of a coefficient's sign
+        self._signs = combination.error * SAFETY + 2.0**-1000, part, size, constant, its_size
+
+    @functools.cached_property
+    def _rising(self) -> Array:
+        """Which ends may rise with which ends of the values, ``(2 values, 2 rows)``."""
+        doubt, part, size, _, _ = self._signs  # of a coefficient's sign
         rising, falling = ((size > 0) & (sign * part + size * doubt > 0) for sign in (1.0, -1.0))
-        self._rising = np.block([[rising, falling], [falling, rising]]).astype(float)
-        above, below = (sign * constant + its_size * doubt > 0 for sign in (1.0, -1.0))
-        self._constant_rises = np.r_[above, below].astype(float)
+        return np.block([[rising, falling], [falling, rising]]).astype(float)
+
+    @functools.cached_property
+    def _constant_rises(self) -> Array:
+        """Which ends the constant may raise, ``(2 rows,)``."""
+        doubt, _, _, constant, size = self._signs
+        above, below = (sign * constant + size * doubt > 0 for sign in (1.0, -1.0))
+        return np.r_[above, below].astype(float)
 
     def __call__(self, ends: Array) -> Sides:
         """Its bounds."""
         x = ends[..., self._first : self._last].reshape(*ends.shape[:2], -1)
         lost = None
-        if not math.isfinite(x[1].sum()):
+        if not all_finite(x[1]):
             lost = ~np.isfinite(x[0])
             x = np.where(lost, 0.0, x)
         value, size = x @ self._matrix + self._constant
@@ -166,7 +175,7 @@ class _Fold:
             top = np.where(crossing & (positive == 0), 0.0, top)
         if lost is not None:
             top = np.where(lost.astype(float) @ self._rising > 0, math.inf, top)
-        if not math.isfinite(top.sum()):
+        if not all_finite(top):
             top = np.where(np.isfinite(value) & np.isfinite(top), top, math.inf)
         rows = top.shape[-1] // 2
         return 0.0 - top[:, rows:], top[:, :rows]
@@ -181,9 +190,16 @@ def _squares(node: Node) -> Array | None:
     return same if same.any() else None
 
 
-def _both(a: Sides, b: Sides) -> Sides:
+def within(bounds: Sides, others: Sides) -> Sides:
     """What holds if both hold; what is no number says nothing."""
-    return np.fmax(a[0], b[0]), np.fmin(a[1], b[1])
+    return np.fmax(bounds[0], others[0]), np.fmin(bounds[1], others[1])
+
+
+def with_form(node: Node, operands: Sides, form: Sides) -> tuple[Sides, Sides]:
+    """What a form and intervals say of the operands of an operation, or of the first ones; what is known of all."""
+    low, high = (side[:, : form[0].shape[-1]] for side in operands)
+    both = within(form, (low, high))
+    return both, both if node.rule in ("function", "product") else operands
 
 
 def _sums(node: Node, operands: Sides) -> Sides:

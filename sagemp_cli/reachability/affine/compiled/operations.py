@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sagemp_cli.reachability.affine.compiled.arrays import added, like, widened, with_fresh
+from sagemp_cli.reachability.affine.compiled.beside import ONE_KINK, Beside
 from sagemp_cli.reachability.affine.compiled.folding import Node
 from sagemp_cli.reachability.affine.compiled.hints import Hint, Hints, hint_of
 from sagemp_cli.reachability.relaxations import arctangent2 as _arctangent2
@@ -65,7 +66,6 @@ class Factors(NamedTuple):
         radius_x, radius_y: of ``|X|`` and ``|Y|``.
         middle: what the product's form counts of ``X Y`` itself; the rest is its error.
         magnitude_x, magnitude_y: of the factors.
-        centers: of the factors, one after the other, ``(B, 2E)``.
     """
 
     x: Array
@@ -78,13 +78,6 @@ class Factors(NamedTuple):
     middle: Array
     magnitude_x: Array
     magnitude_y: Array
-    centers: Array
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Of both factors, one after the other, ``(B, 2E)``, rounding included."""
-        radius = functions_of(self.centers).cat([self.radius_x, self.radius_y], -1)
-        return self.centers - radius, self.centers + radius
 
     @property
     def sum(self) -> Array:
@@ -151,17 +144,26 @@ class Frame:
         both: centre and magnitude of the states, ``(2, B, n)``.
         size: number of variables so far.
         relaxed: the operations so far.
-        within: bounds of the operands of the operation whose turn it is, by intervals, ``(B, operands)``; None if
-            nothing is known.
+        beside: what intervals know of the operation whose turn it is; None if nothing is known.
+        operand: bounds of the operand, or the first operands, of the operation whose turn it is, by form.
     """
 
-    def __init__(self, states: Zonotope, *, inputs: int, own_radius: Array, hints: Hints | None = None) -> None:
+    def __init__(
+        self,
+        states: Zonotope,
+        *,
+        inputs: int,
+        own_radius: Array,
+        hints: Hints | None = None,
+        beside: Beside | None = None,
+    ) -> None:
         self._m = functions_of(states.center)
         self.both = self._m.stack([states.center, abs(states.center) + states.reach + TINY])
         self.states, self.hints, self.own_radius = states, hints, own_radius
         self.size = inputs
         self.relaxed: list[Relaxed] = []
-        self.within: tuple[Array, Array] | None = None
+        self.beside = beside
+        self.operand: tuple[Array, Array] | None = None
 
     @property
     def sum_error(self) -> float:
@@ -200,6 +202,9 @@ class Frame:
         if not isinstance(of_state, np.ndarray):
             return abs(of_state @ generators).sum(-1) + radius
         block = max(_BLOCK // (len(generators) * coefficients.shape[-2]), 64)
+        if generators.shape[-1] <= block:
+            part = of_state @ generators
+            return radius + np.abs(part, out=part) @ _ONES[: part.shape[-1]]
         for first in range(0, generators.shape[-1], block):
             part = of_state @ generators[..., first : first + block]
             radius = radius + np.abs(part, out=part) @ _ONES[: part.shape[-1]]
@@ -253,15 +258,12 @@ class Frame:
 
     def operand_bounds(self, x: Value) -> tuple[Array, Array]:
         """Bounds of the operand, or the first operands, of the operation whose turn it is: by form and by interval."""
-        return self.both_hold(*self.bounds(x))
+        return self.sharpened(*self.bounds(x))
 
-    def both_hold(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Bounds of the first operands, intersected with their intervals; what is no number says nothing."""
-        if self.within is None:
-            return lower, upper
-        m = functions_of(lower)
-        low, high = (side[:, : lower.shape[-1]] for side in self.within)
-        return m.fmax(lower, low), m.fmin(upper, high)
+    def sharpened(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """The same, of which the form says this."""
+        self.operand = lower, upper
+        return self.operand if self.beside is None else self.beside.sharpened(lower, upper)
 
     def hint(self, name: str, size: int, after: Sequence[tuple[str, int]] = ()) -> Hint | None:
         """What is known of the next operation, or of the one that comes after these."""
@@ -275,13 +277,6 @@ class Frame:
         coefficients = with_fresh(coefficients, factor, self.size, relaxed.radius)
         self.size += relaxed.radius.shape[-1]
         return Value(self._m.stack([center, magnitude + relaxed.radius]), coefficients, BAND, relaxed.radius)
-
-
-def noticeably(node: Node, lower: Array, upper: Array, low: Array, high: Array) -> Array:
-    """In which cells the second bounds of an operand, within the first, are noticeably tighter anywhere, ``(B,)``."""
-    kinked = node.relaxation is not None and node.relaxation.name in KINKED
-    part = NOTICEABLE_AT_A_KINK if kinked else NOTICEABLE
-    return ~(high - low >= (upper - lower) * part - ROUNDING * (abs(lower) + abs(upper))).all(-1)
 
 
 class Bounded(NamedTuple):
@@ -309,7 +304,7 @@ def _function(node: Node, frame: Frame, x: Value) -> Value:
     assert node.relaxation is not None
     name, operation, parameters = node.relaxation
     bounds = frame.bounds_at_kinks(x) if name in ONE_KINK else frame.bounds(x)
-    lower, upper = _narrowed(*frame.both_hold(*bounds), frame.hint(name, node.size))
+    lower, upper = _narrowed(*frame.sharpened(*bounds), frame.hint(name, node.size))
     return enclosed(node, frame, Bounded(x, lower, upper, operation.band_of(lower, upper, *parameters)))
 
 
@@ -360,11 +355,12 @@ def _ends(
     # Tensors are better summed from one product with the generators, arrays in blocks.
     parts = operands.coefficients if arrays else frame.rows(operands.coefficients)
     radius = (frame.radius(parts) if arrays else abs(parts).sum(-1)) + slack
-    by_intervals = within and frame.within is not None
-    if by_intervals:  # X is off by the form's own rounding, which is in the slack
+    by_intervals = within and frame.beside is not None
+    if within:
         center = operands.both[0]
-        low, high = frame.both_hold(center - radius, center + radius)
-        radius = m.fmin(radius, m.maximum(high - center, center - low) * SAFETY + slack)
+        low, high = frame.sharpened(center - radius, center + radius)
+        if by_intervals:  # X is off by the form's own rounding, which is in the slack
+            radius = m.fmin(radius, m.maximum(high - center, center - low) * SAFETY + slack)
     radius_x, radius_y = radius[:, :size], radius[:, size:]
     with constant(radius):
         ratio = m.sqrt(radius_y / radius_x)
@@ -400,7 +396,7 @@ def _product(node: Node, frame: Frame, operands: Value, *, within: bool = True) 
         half * SAFETY + magnitude * (of_product(error) * SAFETY),
         frame.size,
         Value(m.stack([center, magnitude]), coefficients, error),
-        factors=Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my, operands.both[0]),
+        factors=Factors(gx, gy, ratio, plus, minus, radius_x, radius_y, middle, mx, my),
     )
     return frame.result(relaxed, center, magnitude, coefficients, 1.0)
 
@@ -516,16 +512,8 @@ def _sums(node: Node, frame: Frame, operands: Value) -> Value:
     return enclosed(node, frame, Bounded(form, lower, upper, band, given=(error,)))
 
 
-ONE_KINK = ("relu", "leaky_relu")
-"""Functions that are linear on either side of 0: of which side it is nothing more has to be known."""
 WIDE = 48
 """Entries of an operation from which on signs are looked for first."""
-KINKED = ("relu", "leaky_relu", "clamp", "abs")
-NOTICEABLE_AT_A_KINK, NOTICEABLE = 0.9, 0.65
-"""What part of a form's width an operand's interval has at most where it is worth the time: errors at a kink are of
-first order in that width, those of all else of second."""
-ROUNDING = 1e-10
-"""A width this small, relative to the values, may be rounding only."""
 _BLOCK = 2**16
 """Entries of an array that stays in the processor's cache."""
 _ONES = np.ones(_BLOCK)

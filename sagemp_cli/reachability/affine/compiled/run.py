@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,29 +21,26 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.reachability.affine.compiled.arrays import added, applied, repeated
+from sagemp_cli.reachability.affine.compiled.beside import Beside, Sides
 from sagemp_cli.reachability.affine.compiled.folding import Combination, Compiled, Node, compiled
 from sagemp_cli.reachability.affine.compiled.hints import Hints
-from sagemp_cli.reachability.affine.compiled.intervals import Carried, Intervals
+from sagemp_cli.reachability.affine.compiled.intervals import Carried, Intervals, with_form, within
 from sagemp_cli.reachability.affine.compiled.operations import (
     EVALUATE,
     Bounded,
     Frame,
-    Relaxed,
     Value,
     enclosed,
-    noticeably,
     sine_and_cosine_operands,
 )
 from sagemp_cli.reachability.program.loops import RecordedLoop
 from sagemp_cli.reachability.program.program import Program
-from sagemp_cli.reachability.relaxations.functions import functions_of
+from sagemp_cli.reachability.relaxations.functions import all_finite, functions_of
 from sagemp_cli.sets import Box
 from sagemp_cli.sets.rounding import TINY, combined
 from sagemp_cli.sets.zonotope import Zonotope
 
 Array = np.ndarray | Tensor
-Sides = tuple[Any, Any]
-"""Lower and upper bounds, ``(B, entries)`` each."""
 
 
 class Done(NamedTuple):
@@ -57,7 +53,11 @@ class Done(NamedTuple):
         low, high: bounds of the next state, ``(B, n)``.
         watched: bounds of control and deviation, ``(B, m)`` each; None unless asked for and said by the loop.
         form: of the same; None unless said by the loop.
-        trace: of it what a check needs.
+        operands: of every operation, bounds of its operand, or the first ones, by form; None where that is
+            not known.
+        lost: cells ``(B,)`` whose set has no bounds any more, because an operation's domain was left; None if there are
+            none.
+        used: whether intervals made a difference to the forms of any cell.
     """
 
     frame: Frame
@@ -67,54 +67,13 @@ class Done(NamedTuple):
     high: Array
     watched: Sides | None
     form: Value | None
-    trace: Trace
-
-
-class Trace(NamedTuple):
-    """What is kept of a step until it is checked.
-
-    Attributes:
-        before: bounds of the states before, ``(B, n)`` each.
-        operands: bounds of the operands of all operations by their forms, as far as they are known; none at all where
-            intervals were carried in every cell.
-        after: bounds of the next state by its form.
-    """
-
-    before: Sides
-    operands: list[Sides | None]
-    after: Sides
-
-
-class Missed(NamedTuple):
-    """What intervals know of steps that were taken without them.
-
-    Attributes:
-        cells: where they are tighter, ``(B,)``.
-        watched: bounds of control and deviation, ``(B, m)`` each, of every step; none unless asked for.
-    """
-
-    cells: np.ndarray
-    watched: Sequence[Sides]
-
-
-BLOCK = 64
-"""Steps that are taken by forms alone, at most, before they are checked against intervals."""
-
-NOTHING = 1e-11
-"""How much tighter than a form an interval may be by rounding, relative to the values."""
+    operands: Sequence[Sides | None]
+    lost: Array | None
+    used: bool
 
 
 class Steps:
     """The steps of a recorded loop, compiled, with their numbers and the disturbance.
-
-    On arrays every value has an interval beside its form (:mod:`.affine.compiled.intervals`), wherever that can make a
-    difference: where feedback keeps hold of a loop forms are tighter throughout, and intervals cost time. So they are
-    carried along only in cells where they make something tighter, and steps without them are checked, many at once,
-    which takes little longer than one (:meth:`check`): if an interval is tighter at any step, all steps are to be taken
-    again. No tube is ever wider than by intervals alone.
-
-    On tensors, where a tube is trained, intervals serve only cells in which an operation's domain was left: an end that
-    an interval decides has no gradient with respect to what is trained.
 
     Args:
         loop: what steps.
@@ -129,73 +88,75 @@ class Steps:
     ) -> None:
         numbers = loop.numbers_in(cells) if len(loop.batch) else loop.numbers[:, None]
         numbers = numbers.flatten(1, -2)
-        self.every_cell = np.ones(cells.numel(), dtype=bool)
+        self._no_cell = np.zeros(cells.numel(), dtype=bool)
         self._watch = watch
-        self._ready = [_Ready(p, numbers, disturbance, tensors=tensors) for p in loop.programs]
+        self._ready = [Ready(p, numbers, disturbance, tensors=tensors) for p in loop.programs]
 
-    def evaluate(
-        self, k: int, states: Zonotope, box: Sides, hints: Hints | None = None, carrying: np.ndarray | None = None
-    ) -> Done:
-        """Step k from a set.
+    @property
+    def alike(self) -> bool:
+        """Whether all are one program."""
+        return len(self._ready) == 1
+
+    def by_forms(self, k: int, states: Zonotope, hints: Hints | None = None) -> Done:
+        """Step k from a set, with nothing but the affine rules.
+
+        Args:
+            k: which step.
+            states: the set.
+            hints: what is known of the operations.
+        """
+        return self._taken(k, states, hints)
+
+    def beside_intervals(self, k: int, states: Zonotope, box: Sides, hints: Hints | None = None) -> Done:
+        """The same with what intervals know where they make a difference, or where a set would be lost; of arrays.
 
         Args:
             k: which step.
             states: the set.
             box: bounds of the states besides, ``(B, n)`` each.
             hints: what is known of the operations.
-            carrying: cells ``(B,)`` in which intervals are carried along; None: only where an operation's domain is
-                left otherwise.
         """
-        ready = self._of(k)
+        done = self._taken(k, states, hints, box, Beside(self._no_cell, noticing=True))
+        if done.lost is None or done.frame.beside is None:
+            return done
+        return self._taken(k, states, hints, box, Beside(done.frame.beside.cells | done.lost, noticing=True))
 
-        def taken(cells: Any) -> tuple[Frame, Value, Value | None, Carried | None]:
-            carried = ready.carried([k], *box) if cells is not None and bool(cells.any()) else None
-            frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=hints)
-            return frame, *ready.evaluate(k, frame, carried, cells), carried
+    def kept(self, k: int, states: Zonotope, box: Sides, hints: Hints | None = None) -> Done:
+        """The same with what intervals know only in cells whose set would be lost.
 
-        frame, after, form, carried = taken(carrying)
-        if carrying is None and not math.isfinite(after.both.sum().item()):
+        An end that an interval decides has no gradient with respect to what a tube is trained for.
+        """
+        done = self._taken(k, states, hints)
+        if done.lost is None:
+            return done
+        return self._taken(k, states, hints, box, Beside(done.lost, noticing=False))
+
+    def _taken(
+        self, k: int, states: Zonotope, hints: Hints | None, box: Sides | None = None, beside: Beside | None = None
+    ) -> Done:
+        ready = self.of(k)
+        carried = None if box is None or beside is None else ready.carried([k], *box)
+        frame = Frame(states, inputs=ready.inputs, own_radius=ready.radius_at(k), hints=hints, beside=beside)
+        after, form, operands = ready.evaluate(k, frame, carried)
+        following, lost = frame.advanced(after), None
+        if not all_finite(after.both):
             m = functions_of(after.both)
             lost = m.isfinite(states.reach).all(-1) & ~m.isfinite(after.both).all(0).all(-1)
-            if bool(lost.any()):  # intervals may know better
-                frame, after, form, _ = taken(lost)
-        following = frame.advanced(after)
-        form_of_next = low, high = following.low, following.high
+            lost = lost if bool(lost.any()) else None
+        low, high = following.low, following.high
         watched = None if form is None or not self._watch else frame.bounds(form)
-        if carrying is not None and carried is not None:
-            known = _of_cells(carried.next(), carrying)
-            low, high = np.fmax(low, known[0]), np.fmin(high, known[1])
-            if watched is not None:
-                known = _of_cells(carried.watched(), carrying)
-                watched = np.fmax(watched[0], known[0]), np.fmin(watched[1], known[1])
-        operands = [] if carrying is None or carrying.all() else ready.operand_bounds(frame)
-        trace = Trace(box, operands, form_of_next)
-        return Done(frame, after, following, low, high, watched, form, trace)
+        used = beside is not None and bool(beside.cells.any())
+        if carried is not None and beside is not None and beside.noticing:
+            low, high = within((low, high), carried.next())
+            watched = watched and within(watched, carried.watched())
+        return Done(frame, after, following, low, high, watched, form, operands, lost, used)
 
-    def check(self, first: int, steps: Sequence[Trace], carrying: np.ndarray | None) -> Missed:
-        """What intervals know of steps, the first of which is step ``first``, in cells where they were not carried."""
-        none = np.zeros_like(self.every_cell)
-        if carrying is None or carrying.all():
-            return Missed(none, [])
-        cells, sharper = none, []
-        every = list(enumerate(steps, start=first))
-        for group in [every] if len(self._ready) == 1 else [[one] for one in every]:
-            numbers, traces = zip(*group, strict=True)
-            ready = self._of(numbers[0])
-            carried = ready.carried(numbers, *_together([t.before for t in traces]))
-            tighter = ready.followed(carried, [t.operands for t in traces])
-            tighter = tighter | _tighter(_together([t.after for t in traces]), carried.next())
-            cells = cells | tighter.reshape(len(traces), -1).any(0)
-            if self._watch and ready.watches:
-                sides = (np.split(side, len(traces)) for side in carried.watched())
-                sharper += list(zip(*sides, strict=True))
-        return Missed(cells & ~carrying, sharper)
-
-    def _of(self, k: int) -> _Ready:
+    def of(self, k: int) -> Ready:
+        """The program of step k."""
         return self._ready[k if len(self._ready) > 1 else 0]
 
 
-class _Ready:
+class Ready:
     """One program, compiled, with the numbers of all steps."""
 
     def __init__(self, program: Program, numbers: Tensor, disturbance: Box, *, tensors: bool) -> None:
@@ -224,87 +185,49 @@ class _Ready:
         sides = (side if isinstance(side, np.ndarray) else side.detach().numpy() for side in (low, high))
         return Carried(self._intervals(), steps, *sides)
 
-    def evaluate(self, k: int, frame: Frame, carried: Carried | None, cells: Any) -> tuple[Value, Value | None]:
-        """The next state, and control and deviation if the loop says them.
+    def evaluate(self, k: int, frame: Frame, carried: Carried | None) -> tuple[Value, Value | None, list[Sides | None]]:
+        """The next state, control and deviation if the loop says them, and the operands of all operations.
 
         Args:
             k: which step.
             frame: the set before it; what is done is noted there.
             carried: intervals to be carried along.
-            cells: where they are used.
         """
         results: list[Value] = []
+        operands: list[Sides | None] = []
         known: list[Bounded] = []  # of a function whose turn is next
         for i, (node, fold) in enumerate(self._nodes):
-            operands = None
-            if carried is not None:
-                operands = carried.operand(i)
-                frame.within = _of_cells(operands, cells)
+            between = None if carried is None else carried.operand(i)
+            if between is not None and frame.beside is not None:
+                frame.beside.turn(node, between)
             if known:
                 results.append(enclosed(node, frame, known.pop()))
-            elif i in self._pairs:
-                after, _ = self._nodes[i + 1]
-                first, second = sine_and_cosine_operands(node, after, frame, fold(k, frame, results))
-                results.append(enclosed(node, frame, first))
-                known.append(second)
             else:
-                results.append(EVALUATE[node.rule](node, frame, fold(k, frame, results)))
-            if carried is not None and operands is not None:
-                carried.know(i, operands, _operand_bounds(node, frame.relaxed[-1]))
+                frame.operand = None
+                if i in self._pairs:
+                    after, _ = self._nodes[i + 1]
+                    first, second = sine_and_cosine_operands(node, after, frame, fold(k, frame, results))
+                    results.append(enclosed(node, frame, first))
+                    known.append(second)
+                else:
+                    results.append(EVALUATE[node.rule](node, frame, fold(k, frame, results)))
+            operands.append(frame.operand)
+            if carried is not None and between is not None:
+                if frame.operand is not None:
+                    _, between = with_form(node, between, frame.operand)
+                carried.know(i, between)
         watched = None if self._watched is None else self._watched(k, frame, results)
-        return self._next(k, frame, results), watched
+        return self._next(k, frame, results), watched, operands
 
     @property
     def watches(self) -> bool:
         """Whether the loop says its controls or deviations."""
         return self._watched is not None
 
-    def operand_bounds(self, frame: Frame) -> list[Sides | None]:
-        """Bounds of the operands of all operations by their forms, as far as they are known."""
-        return [_operand_bounds(node, r) for (node, _), r in zip(self._nodes, frame.relaxed, strict=True)]
-
-    def followed(self, carried: Carried, operands: Sequence[Sequence[Sides | None]]) -> np.ndarray:
-        """Let intervals follow steps that were taken; where they are noticeably tighter, ``(steps * B,)``."""
-        tighter = np.zeros(1, dtype=bool)
-        for i, (node, _) in enumerate(self._nodes):
-            known = carried.operand(i)
-            every = [of_step[i] for of_step in operands]
-            form = None
-            if every[0] is not None:
-                form = _together(every)
-                low, high = (side[:, : form[0].shape[-1]] for side in known)
-                tighter = tighter | noticeably(node, *form, np.fmax(form[0], low), np.fmin(form[1], high))
-            carried.know(i, known, form)
-        return tighter
-
-
-def _operand_bounds(node: Node, relaxed: Relaxed) -> Sides | None:
-    """Bounds of the operands of an operation by its form, of the first ones at least; None if they are not known."""
-    if node.rule == "product" and relaxed.factors is not None:
-        return relaxed.factors.bounds
-    return None if node.rule in ("angle", "quotient") else (relaxed.lower, relaxed.upper)
-
-
-def _together(sides: Sequence[Any]) -> Sides:
-    """Bounds of several steps, one after the other."""
-    low, high = (np.concatenate(side) for side in zip(*sides, strict=True))
-    return low, high
-
-
-def _tighter(form: Sides, interval: Sides) -> np.ndarray:
-    """In which cells the interval has an end inside of the form's bounds, but for rounding, ``(B,)``."""
-    doubt = NOTHING * (abs(form[0]) + abs(form[1]))
-    return ~((interval[0] <= form[0] + doubt) & (interval[1] >= form[1] - doubt)).all(-1)
-
-
-def _of_cells(sides: tuple[np.ndarray, np.ndarray], cells: Any) -> Sides:
-    """Bounds that say something of some cells only, as arrays or tensors, as what the cells are."""
-    if isinstance(cells, np.ndarray):
-        if cells.all():
-            return sides
-        return np.where(cells[:, None], sides[0], -math.inf), np.where(cells[:, None], sides[1], math.inf)
-    low, high = map(torch.from_numpy, sides)
-    return torch.where(cells[:, None], low, -math.inf), torch.where(cells[:, None], high, math.inf)
+    @property
+    def nodes(self) -> list[Node]:
+        """The nonlinear operations, in the order of evaluation."""
+        return [node for node, _ in self._nodes]
 
 
 def _placed(tensor: Tensor, tensors: bool) -> Array:
