@@ -11,7 +11,7 @@ import typer
 
 from sagemp_cli.cli.command import examples, printable
 from sagemp_cli.cli.options import Json
-from sagemp_cli.errors import ANSWER_CODES
+from sagemp_cli.errors import ANSWER_CODES, UsageError
 
 if TYPE_CHECKING:
     from sagemp_cli.checker.check import Finding, Report
@@ -21,6 +21,7 @@ EXAMPLES = examples(
     "sagemp check artifacts/unicycle_node/certificate.h5",
     "sagemp check artifacts/unicycle_node/library.h5 --processes 2",
     "sagemp check certificate.h5 --against experiment=unicycle_node --against effort=demo",
+    "sagemp check my_robot_Robot.h5 --against my_robot.py:Robot --network controller.onnx",
     "sagemp check certificate.h5 --json | jq .answer",
 )
 
@@ -33,9 +34,14 @@ def check(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUE",
-            help="Compare what is proved with the config of these overrides, e.g. experiment=unicycle_node.",
+            help="Compare what is proved with the config of these overrides, e.g. experiment=unicycle_node; of an ODE "
+            "with a robot of your own, FILE.py:NAME.",
             show_default=False,
         ),
+    ] = None,
+    network: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of that robot: the ONNX file of its controller.", show_default=False),
     ] = None,
 ) -> None:
     """Prove a certificate or a library again, in ball arithmetic, from the file alone.
@@ -50,7 +56,7 @@ def check(
     from sagemp_cli.cli.console import console_progress
 
     report = prove(file, processes=processes, progress=console_progress())
-    found = None if not against else _compared(report, against)
+    found = None if not against else _compared(report, against, network)
     if as_json:
         typer.echo(json.dumps(as_data(report, found), indent=2))
     else:
@@ -61,8 +67,18 @@ def check(
     raise typer.Exit(code if found is None or code or all(d.covers for d in found) else ANSWER_CODES["UNKNOWN"])
 
 
-def _compared(report: Report, against: list[str]) -> list[Difference]:
-    """What differs between the file and a config."""
+def _compared(report: Report, against: list[str], network: Path | None) -> list[Difference]:
+    """What differs between the file and a config, or a robot as an ODE."""
+    if ".py:" in against[0]:
+        from sagemp_cli.plugins.loading import load_object
+        from sagemp_cli.stages.against_plant import plant_differences
+        from sagemp_cli.stages.prove_ode import plant_of
+
+        if len(against) > 1:
+            raise UsageError("--against takes a config or one robot, FILE.py:NAME")
+        return plant_differences(report, plant_of(load_object(against[0])[0], network))
+    if network is not None:
+        raise UsageError("--network means nothing here: it is of a robot, --against FILE.py:NAME")
     from sagemp_cli.config.composition import compose
     from sagemp_cli.pipeline.against import differences
 

@@ -113,6 +113,31 @@ def test_an_angle_that_jumps_is_bounded_by_its_whole_circle(tmp_path):
     assert found.answer == "UNKNOWN" and "margin of 'turn' is only proved to be -1.14" in found.findings[0].reason
 
 
+def test_margins_of_all_kinds_of_operations_are_proved_again(tmp_path):
+    """With kinks, jumps and branches too: what has no derivative is bounded over the whole of each part."""
+    margins = {
+        "where": lambda x: 2 + torch.where(x[..., :1] > 0.25, x[..., :1], x[..., 1:]),
+        "jumps": lambda x: 4 + torch.floor(x[..., :1] * 10) + torch.sign(x[..., 1:]) + torch.remainder(x[..., :1], 0.3),
+        "larger": lambda x: 3 + torch.maximum(x[..., :1], x[..., 1:]) - torch.minimum(x[..., :1], x[..., 1:] * 2),
+        "limits": lambda x: 3 + x.clamp(-0.1, 0.2) + torch.nn.functional.gelu(x),
+        "shares": lambda x: torch.softmax(x, -1),
+        "quotient": lambda x: 3 - 1 / (x[..., :1] + 2) + torch.exp(x[..., 1:]) * torch.tanh(x[..., :1]),
+        "angle": lambda x: 4 - torch.atan2(x[..., 1:], x[..., :1]),
+    }
+    made = proof([Holds(g, name=name) for name, g in margins.items()], horizon=2, substeps=2, order=2)
+    assert made.answer is Answer.VERIFIED
+    written(made, tmp_path / "kinds.h5")
+    report = check(tmp_path / "kinds.h5")
+    assert report.answer == "VERIFIED", report.findings
+    states = np.concatenate(solutions(report.document, np.random.default_rng(3), count=200))
+    for one in report.document.requirements:
+        assert margin_of_torch(margins[one.name], states) >= report.findings[0].margins[one.name] - 1e-9, one.name
+
+
+def margin_of_torch(function, states):
+    return float(function(torch.from_numpy(states)).min())
+
+
 def test_what_is_not_bounded_or_not_proved_is_stored_as_that(tmp_path):
     written(proof([Inside({"angle": (-0.5, 0.25)})]), tmp_path / "open.h5")
     report = check(tmp_path / "open.h5")

@@ -32,6 +32,19 @@ class Wants(Robot):
         return network(x)
 
 
+class Other(Robot):
+    period, horizon = 0.1000001, 13
+    start = ((0.2, 0.31), (-0.1, 0.1))
+    disturbance = ((0.0, 0.0), (-1e-9, 1e-9))
+    requirements = [Inside({"angle": (-0.5, 0.49)})]
+
+    def control(self, x):
+        return 1.000001 * super().control(x)
+
+    def rate(self, x, u):
+        return super().rate(x, u) + 1e-6
+
+
 class Fails(Robot):
     requirements = [Inside({"speed": (0.0, 1.0)})]
 
@@ -59,6 +72,14 @@ def test_a_robot_that_says_all_of_it_is_proved_with_one_argument(sagemp, robots,
     checked = sagemp("check", data["certificate"])
     assert checked.exit_code == 0, checked.output
     assert "requirement inside  at all these times: angle -0.5 to 0.5" in checked.stdout
+    same = sagemp("check", data["certificate"], "--against", f"{robots}:Robot")
+    assert same.exit_code == 0 and "no difference" in same.stdout
+    other = sagemp("check", data["certificate"], "--against", f"{robots}:Other")
+    assert other.exit_code == 5
+    for what in ("X_I", "W", "period", "K", "control", "ODE", "requirement 'inside'"):
+        assert f"  {what}: proved " in other.stdout, what
+    again = sagemp("check", data["certificate"], "--against", "experiment=x", "--network", "none.onnx")
+    assert again.exit_code == 2 and "--network means nothing here" in again.stderr
     again = sagemp("recheck", data["certificate"], "disc")
     assert again.exit_code == 2 and "about requirements of an ODE of one's own" in again.stderr
     again = sagemp("prove", f"{robots}:Robot")

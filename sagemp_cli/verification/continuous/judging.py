@@ -56,7 +56,7 @@ class Asked:
                 f"{loop.horizon} periods of {loop.period:g} s"
             )
         margins = observable(formula.margins, loop, example, formula.name)
-        first, last = (min(_snapped(t / loop.period), float(loop.horizon)) for t in (formula.first, formula.last))
+        first, last = (in_periods(t, loop.period, loop.horizon) for t in (formula.first, formula.last))
         return Asked(formula, margins, first, last)
 
     def times(self, loop: SampledLoop, substeps: int) -> tuple[Tensor, Tensor]:
@@ -71,8 +71,12 @@ class Asked:
         return margins.amin(-1) if self.formula.every else margins.amax(-1)
 
 
-def _snapped(place: float) -> float:
-    return float(round(place)) if math.isfinite(place) and abs(place - round(place)) < _NEAR else place
+def in_periods(time: float, period: float, horizon: int) -> float:
+    """A time in periods, the horizon at most; one that is near a sample is that sample."""
+    place = time / period
+    if math.isfinite(place) and abs(place - round(place)) < _NEAR:
+        place = float(round(place))
+    return min(place, float(horizon))
 
 
 @dataclass(frozen=True)
