@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,8 @@ def as_lines(certificate: Artifact[Certificate]) -> list[str]:
             lines.append(f"  reference {i}: SAFE {data['holds']}{near}")
         else:
             lines.append(f"  reference {i}: {item['verdict']} at {item['time']} ({item['constraint']})")
+    if data["lag"] is not None:
+        lines.append(f"  control: {data['lag']}")
     if data["stand_in"]:
         lines.append(f"  plans: of a {data['stand_in']}")
     if data["learned"] is not None:
@@ -152,6 +155,7 @@ def as_json(certificate: Artifact[Certificate]) -> dict[str, Any]:
         "certified": sum(v == "SAFE" for v in tubes.verdict),
         "references": references,
         "controls": _controls(certificate),
+        "lag": None if record.loop.lag is None else lag_words(record.loop.lag.tolist()),
         "learned": _learned(certificate),
         "counterexamples": [
             {
@@ -203,6 +207,20 @@ def _controls(certificate: Artifact[Certificate]) -> list[dict[str, Any]]:
         )
         if math.isfinite(least) and math.isfinite(most)
     ]
+
+
+def lag_words(lag: Sequence[Sequence[float]]) -> str:
+    """Bounds of a control's delay and of its measurement's jitter, in seconds, in words."""
+
+    def seconds(least: float, most: float) -> str:
+        return f"{most:g} s" if least == most else f"{least:g} to {most:g} s" if least else f"up to {most:g} s"
+
+    (late, old), words = lag, []
+    if late[1]:
+        words.append(f"{seconds(*late)} late")
+    if old[1]:
+        words.append(f"of a state {seconds(*old)} old")
+    return ", ".join(words)
 
 
 def _learned(certificate: Artifact[Certificate]) -> dict[str, Any] | None:

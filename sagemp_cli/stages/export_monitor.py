@@ -32,6 +32,11 @@ def export_monitor(path: Path, to: Path, *, overwrite: bool = False) -> tuple[in
     if not isinstance(artifact.record, Certificate | Library) or not artifact.unchanged:
         raise UsageError(f"{path}: tubes are in certificates and libraries that nobody changed, this is none")
     tubes, loop = artifact.record.tubes, artifact.record.loop
+    if loop.lag is not None and loop.lag[1, 1] > 0:
+        raise UsageError(
+            f"{path}: what is measured is up to {loop.lag[1, 1]:g} s old, and the tubes are those of the instants: a "
+            "monitor would raise alarms of nothing"
+        )
     safe = [r for r, verdict in enumerate(tubes.verdict) if verdict == "SAFE"]
     if not safe:
         raise UsageError(f"{path}: no reference is certified, so there is nothing to watch")

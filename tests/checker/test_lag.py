@@ -9,11 +9,13 @@ import torch
 
 from sagemp_cli.checker.check import check
 from sagemp_cli.checker.claim import claim_rows
-from sagemp_cli.errors import ArtifactError
+from sagemp_cli.cli.verdict import lag_words
+from sagemp_cli.errors import ArtifactError, UsageError
 from sagemp_cli.pipeline.against import differences
 from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.sets import Box
+from sagemp_cli.stages.export_monitor import export_monitor
 from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
 from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verification import verify_references
@@ -167,3 +169,20 @@ def test_what_the_attack_refutes_under_a_lag_the_checker_refutes(tmp_path):
     late[3, 4] = 0.06
     path = made.write(tmp_path / "other.h5", counterexamples=(dataclasses.replace(record, disturbances=late),), **write)
     assert check(path).counterexamples == ((0, "its delays and jitters are not within their bounds"),)
+
+
+@pytest.mark.parametrize(
+    ("delay", "jitter", "words"),
+    [
+        ((0.0, 0.02), (0.0, 0.0), "up to 0.02 s late"),
+        ((0.02, 0.02), (0.001, 0.005), "0.02 s late, of a state 0.001 to 0.005 s old"),
+        ((0.0, 0.0), (0.0, 0.01), "of a state up to 0.01 s old"),
+    ],
+)
+def test_a_verdict_says_how_late_a_control_may_be(delay, jitter, words):
+    assert lag_words([delay, jitter]) == words
+
+
+def test_a_monitor_of_older_states_is_refused(path, tmp_path):
+    with pytest.raises(UsageError, match="what is measured is up to 0.02 s old"):
+        export_monitor(path, tmp_path / "monitor.npz")
