@@ -110,3 +110,18 @@ def test_a_sum_of_terms_of_one_sign_does_not_cross_0_and_any_other_does(lower, u
     assert low == pytest.approx(expected[0], abs=1e-14) and low <= expected[0]
     assert high == pytest.approx(expected[1], abs=1e-14) and high >= expected[1]
     assert (low == 0.0) == (expected[0] == 0.0) and (high == 0.0) == (expected[1] == 0.0)
+
+
+def test_the_logarithm_of_a_sum_of_exponentials_encloses_it_and_is_exact_over_a_box():
+    from flint import arb, ctx
+
+    generator = torch.Generator().manual_seed(0)
+    ends = 10 ** (3 * torch.rand(2, 2, 200, generator=generator, dtype=torch.float64) - 1)
+    ends = (ends * torch.where(torch.rand(ends.shape, generator=generator) < 0.5, -1.0, 1.0)).sort(0).values
+    a, b = IntervalForm(*ends[:, 0]), IntervalForm(*ends[:, 1])
+    low, high = evaluate(Instruction("logaddexp", 200), [a, b]).bounds
+    with ctx.workprec(200):
+        for x, y, side, sign in ((a.lower, b.lower, low, 1), (a.upper, b.upper, high, -1)):
+            for p, q, bound in zip(x.tolist(), y.tolist(), side.tolist(), strict=True):
+                exact = (arb(p).exp() + arb(q).exp()).log()
+                assert sign * (exact - bound) >= 0 and abs(exact - bound) <= arb(1e-13) * (1 + abs(exact) + abs(arb(p)))
