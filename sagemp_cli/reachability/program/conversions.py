@@ -83,5 +83,6 @@ def _refuse_choice(name: str) -> None:
 def _refuse_place(name: str) -> None:
     raise UnsupportedOperationError(
         f"torch operation '{name}' depends on which entry is the larger one, which a set does not say; "
-        f"use torch.amax and torch.amin for the values, or torch.maximum and torch.minimum of neighbours to sort"
+        f"use torch.amax and torch.amin for the values, torch.maximum and torch.minimum of neighbours to sort, or "
+        f"sagemp_cli.reachability.decisions.choose(scores, values) for the value of the largest score"
     )
