@@ -80,8 +80,8 @@ class Dynamics(nn.Module):
             raise ConfigError(
                 f"{name}: with time=continuous w is added to the derivative, found disturbance '{disturbance}'"
             )
-        self.lag = Lag.of(name, delay, jitter, float(dt))
-        if self.lag and time != "continuous":
+        self.control_lag = Lag.of(name, delay, jitter, float(dt))
+        if self.control_lag and time != "continuous":
             raise ConfigError(f"{name}: delay and jitter are those of time=continuous; in discrete time there are none")
         self.dt = float(dt)
         self.time: Literal["discrete", "continuous"] = time
@@ -135,16 +135,20 @@ class Dynamics(nn.Module):
 
     def unknowns(self, disturbance: Box) -> Box:
         """What is unknown of every step: w in a box ``(n,)``; if a control lags, the seconds of delay and jitter."""
-        if not self.lag:
+        if not self.control_lag:
             return disturbance
-        sides = zip((disturbance.lower, disturbance.upper), (self.lag.box.lower, self.lag.box.upper), strict=True)
+        sides = zip(
+            (disturbance.lower, disturbance.upper),
+            (self.control_lag.box.lower, self.control_lag.box.upper),
+            strict=True,
+        )
         return Box(*(torch.cat(pair) for pair in sides))
 
     def completed(self, w: Tensor) -> Tensor:
         """Disturbances ``(..., K, d)`` of a rollout; where they say nothing of a lag, it is the least that may be."""
-        if not self.lag or w.shape[-1] != self.state_dim:
+        if not self.control_lag or w.shape[-1] != self.state_dim:
             return w
-        return torch.cat([w, self.lag.box.lower.expand(*w.shape[:-1], 2)], dim=-1)
+        return torch.cat([w, self.control_lag.box.lower.expand(*w.shape[:-1], 2)], dim=-1)
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """One forward-Euler step under the disturbance ``w (..., n)``; in continuous time a simulated solution over one

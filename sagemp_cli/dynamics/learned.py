@@ -78,8 +78,8 @@ class Learned(Dynamics):
             state_upper=robot.state_upper.tolist(),
             disturbance=robot.disturbance,
             time=robot.time if time is None else time,
-            delay=list(robot.lag.delay) if delay is None else delay,
-            jitter=list(robot.lag.jitter) if jitter is None else jitter,
+            delay=list(robot.control_lag.delay) if delay is None else delay,
+            jitter=list(robot.control_lag.jitter) if jitter is None else jitter,
         )
         self.model = robot
         self.activation = activation

@@ -42,6 +42,8 @@ class OpenLoop:
         controls = self.controls[..., :steps, :].expand(*x.shape[:-1], steps, -1)
         for k in range(steps):
             held, u, now = controls[..., max(k - 1, 0), :], controls[..., k, :], w[..., k, :]
-            after = dynamics.lagged(states[-1], held, u, now) if dynamics.lag else dynamics.step(states[-1], u, now)
+            after = (
+                dynamics.lagged(states[-1], held, u, now) if dynamics.control_lag else dynamics.step(states[-1], u, now)
+            )
             states.append(after)
         return torch.stack(states, dim=-2), controls

@@ -69,7 +69,7 @@ class ClosedLoop:
     @property
     def lag(self) -> Box | None:
         """Bounds of the control's delay and its measurement's jitter, in seconds, ``(2,)``; None if there is none."""
-        return self.dynamics.lag.box if self.dynamics.lag else None
+        return self.dynamics.control_lag.box if self.dynamics.control_lag else None
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
         """The undisturbed derivative of the state, ``f(x, u)``."""
@@ -116,7 +116,7 @@ class ClosedLoop:
                 more, see :meth:`~sagemp_cli.dynamics.base.Dynamics.unknowns`; without them it lags as little as it may.
         """
         states, controls, dynamics = [x], [], self.dynamics
-        lags, w = bool(dynamics.lag), dynamics.completed(w)
+        lags, w = bool(dynamics.control_lag), dynamics.completed(w)
         for k in range(w.shape[-2]):
             now = w[..., k, :]
             if not lags:

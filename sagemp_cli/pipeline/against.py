@@ -153,7 +153,7 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
         yield Difference("step", "the network in the file", "a network learned from the formulas", covers=True)
         return
     if document.ode is not None:
-        yield from _lag(document.ode.lag, robot.lag)
+        yield from _lag(document.ode.lag, robot.control_lag)
         yield from _rate(document, document.ode.rate, model)
         return
     program = (document if true is None else true).programs[0]

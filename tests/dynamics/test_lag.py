@@ -42,11 +42,19 @@ def test_a_lag_that_cannot_be_is_one_line(options, message):
 
 
 def test_no_lag_is_no_lag():
-    assert not robot().lag and not robot(delay=0.0, jitter=[0.0, 0.0]).lag
+    assert not robot().control_lag and not robot(delay=0.0, jitter=[0.0, 0.0]).control_lag
     w = Box.around([0.0] * 4, [0.1] * 4)
     assert robot().unknowns(w) is w
     late = robot(delay=0.02, jitter=[0.001, 0.002]).unknowns(w)
     assert late.lower[4:].tolist() == [0.0, 0.001] and late.upper[4:].tolist() == [0.02, 0.002]
+
+
+def test_a_robot_may_have_a_lag_of_its_own():
+    """Of its motors, say, as in the project that `sagemp init` makes."""
+    model = robot()
+    model.lag = 0.25
+    w = torch.zeros(3, 4, dtype=torch.float64)
+    assert not model.control_lag and model.completed(w) is w
 
 
 def solved(model, x, held, u, w, delay, seconds, fine=1000):

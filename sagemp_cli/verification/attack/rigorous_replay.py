@@ -98,7 +98,7 @@ class Replay:
         """In continuous time, with a signal that is constant on every period."""
         cell, n, parts, order = Box(start.lower[None], start.upper[None]), start.dim, None, _ORDER
         w, known = Box(disturbances[:, :n], disturbances[:, :n]), sampled(loop, start)
-        if problem.dynamics.lag:
+        if problem.dynamics.control_lag:
             known = dataclasses.replace(known, lag=Box(disturbances[:, n:], disturbances[:, n:]))
             parts, order = _LAG_PARTS, _LAG_ORDER
         found = reach_continuously(Affine(), known, cell, w, substeps=parts, order=order)
