@@ -217,8 +217,9 @@ def try_one(folder: Path, seed: int, *, every: bool, fresh: bool) -> list[dict[s
 
 
 def comparable(output: str) -> str:
-    """What a command says, without times and the width of rules."""
-    return re.sub(r"\d+(\.\d+)?(e-?\d+)? ?s\b", "s", output)
+    """What a command says, without times and the lines about progress, which a slow run has more of."""
+    kept = "".join(line for line in output.splitlines(True) if not re.fullmatch(r"[a-z ]+: \d+/\d+, .* left\n", line))
+    return re.sub(r"\d+(\.\d+)?(e-?\d+)? ?s\b", "s", kept)
 
 
 def made(folder: Path, target: str, seed: int) -> tuple[str, str]:

@@ -123,11 +123,16 @@ def _plugins(group: str) -> list[str]:
 def _chosen(override: Any) -> str:
     """A group choice as Hydra gets it; the file of an experiment, and a plugin without one, are made known to it."""
     from hydra.core.config_store import ConfigStore
+    from omegaconf.errors import OmegaConfBaseException
 
     group, option = override.key_or_group, override.value()
     if group == "experiment" and is_file(option):
-        option = re.sub(r"\W", "_", f"_{option}")
-        ConfigStore.instance().store(group=group, name=option, node=_experiment(override.value()), package="_global_")
+        path, option = option, re.sub(r"\W", "_", f"_{option}")
+        node = _experiment(path)
+        try:
+            ConfigStore.instance().store(group=group, name=option, node=node, package="_global_")
+        except OmegaConfBaseException as e:
+            raise ConfigError(f"experiment file {path}: {first_line(e)}") from None
         return f"{group}={option}"
     return str(override.input_line)
 

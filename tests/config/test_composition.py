@@ -229,3 +229,12 @@ def test_a_scene_given_too_deep_or_by_a_pipe_is_one_line(tmp_path):
         load_scene(str(tmp_path / "scene.yaml"))
     with pytest.raises(ConfigError, match="nested too deep"):
         compose(["scene=" + "{a:" * 2000 + "1" + "}" * 2000])
+
+
+@pytest.mark.parametrize("text", ["${ or", "${", "a ${b", "${oc.env:", "${scene"])
+def test_an_experiments_file_with_half_an_interpolation_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f'scene: "{text}"\n')
+    with pytest.raises(ConfigError, match=f"experiment file {path}: ") as caught:
+        compose([f"experiment={path}"])
+    assert "\n" not in str(caught.value)
