@@ -7,8 +7,10 @@ import pytest
 import torch
 from solutions import MARGIN, compared, continuous
 
+from sagemp_cli.sets import Box
 from sagemp_cli.storage import Header, write_artifact
 
+from .checker.continuous import flow_case
 from .checker.required import config, in_two_ways, written
 
 
@@ -31,6 +33,13 @@ def test_no_solution_leaves_a_right_certificate_whose_cells_are_divided_in_two_w
     assert continuous(folder / "right.h5")
     right = found(folder / "right.h5")
     assert (right.rollouts, right.outside) == (60, 0) and right.worst <= MARGIN
+
+
+def test_solutions_under_a_control_that_lags_are_compared_too(folder):
+    lag = Box(*torch.tensor([[0.0, 0.005], [0.12, 0.02]], dtype=torch.float64))
+    flow_case(folder / "lag.h5", horizon=3, lag=lag)
+    late = found(folder / "lag.h5")
+    assert (late.rollouts, late.outside) == (60, 0)
 
 
 @pytest.mark.parametrize("name", ["tube_upper", "clearance", "upper"])
