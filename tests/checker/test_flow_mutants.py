@@ -250,7 +250,8 @@ def no_number(t: Truth) -> Iterator[Mutant]:
         name = str(t.rng.choice(list(t.document.flow)))
         c, k, j, i = t.place()
         value = float(t.rng.choice([np.nan, np.inf, -np.inf]))
-        yield flow_with(t.document, name, put((c, k, 0 if name.startswith("inner") else j, i), value))
+        part = () if t.document.flow[name].ndim < 4 else (0 if name.startswith("inner") else j,)
+        yield flow_with(t.document, name, put((c, k, *part, i), value))
 
 
 def disturbance(t: Truth) -> Iterator[Mutant]:
@@ -278,7 +279,7 @@ def division(t: Truth) -> Iterator[Mutant]:
             if name.startswith("inner"):
                 inner = array[:, :, :0] if parts == 1 else np.repeat(array, 3, axis=2)
                 made = flow_with(made, name, lambda _, new=inner: new)
-            else:
+            elif array.ndim == 4:
                 new = array[:, :, :1] if parts == 1 else np.repeat(array, 2, axis=2)
                 made = flow_with(made, name, lambda _, new=new: new)
         yield ode_with(made, substeps=parts)
