@@ -105,7 +105,7 @@ def band(curve: Curve, lower: Tensor, upper: Tensor, *, allowed: Tensor | None =
     slope = _chord(curve, ends, values)
     crossing = _crossing(curve, lower, upper)
     if crossing is not None and bool(crossing.any()):
-        slope = m.where(crossing, _searched(curve, ends, values, radius_objective), slope)
+        slope = _where_crossing(curve, crossing, ends, values, radius_objective, slope)
     found = excess(curve, slope, ends, values)
     radius = 0.5 * (found.most - found.least) + slack(abs(found.most) + abs(found.least), 2) + outside
     return settled(slope, 0.5 * (found.most + found.least), radius)
@@ -202,6 +202,18 @@ def best_slope(
         left, left_grade = torch.where(falls, plane, left), torch.where(falls, grade, left_grade)
         right, right_grade = torch.where(falls, right, plane), torch.where(falls, right_grade, grade)
     return best
+
+
+def _where_crossing(
+    curve: Curve, crossing: Tensor, ends: Tensor, values: Tensor, objective: Objective, slope: Tensor
+) -> Tensor:
+    """The slope, or what is searched where an inflection lies inside, for these intervals alone: a search is dear."""
+    m = functions_of(ends)
+    if all(isinstance(piece.start, float) for piece in curve.pieces) and not bool(crossing.all()):
+        searched = m.zeros_like(slope)
+        searched[crossing] = _searched(curve, ends[:, crossing], values[:, crossing], objective)
+        return m.where(crossing, searched, slope)
+    return m.where(crossing, _searched(curve, ends, values, objective), slope)
 
 
 @torch.no_grad()

@@ -307,7 +307,7 @@ class _Work:
             if not piece.bounded and 2 * count <= room:
                 cells, better = self.narrowed(piece, division, room)
                 if better != division or len(cells.lower) > count:
-                    piece, division, refines = self.piece(cells, better, foresee=True), better, True
+                    piece, division, refines = self.piece(cells, better), better, True
                     continue
             more = finer(division, **self.given) if refines and self.coarse(piece) else None
             if more is not None:
@@ -322,7 +322,7 @@ class _Work:
             halves = self.halved(piece, division)
             if halves is None:
                 break
-            piece, refines = halves, True
+            piece = halves
             vain = vain + 1 if float(piece.judgement.missing.sum()) > 2 * (1 - _GAIN) * before else 0
         return [p for p in (*done, piece) if len(p.cells.lower)]
 
@@ -333,34 +333,36 @@ class _Work:
         """
         first, cells = self.loop.beginning(min(TRIED, self.loop.horizon)), piece.cells
         share, more = float(remainder_share(piece.reach).mean()), finer(division, **self.given)
-        halvings, most_halvings = 0, 1 + round(2 * periods_lost(piece.reach) / self.loop.horizon)
+        reach, halvings = _first(piece.reach, first.horizon), 0
+        most_halvings = 1 + round(2 * periods_lost(piece.reach) / self.loop.horizon)
         while halvings < most_halvings and 2 * len(cells.lower) <= most:
-            reach = self.reach(first, cells, division, foresee=True)
             assert reach.halves is not None
             gains, states = cut_gains(cells, reach.tube, reach.halves).max(1)
             gain = float(gains.mean())
             # Remainders add up: a finer division would gain what they are on average over these periods.
             if more is not None and (share * (first.horizon + 1) / 2 > gain or not bool(reach.tube.bounded.all())):
-                again = self.reach(first, cells, more, foresee=False)
+                again = self.reach(first, cells, more)
                 if float((_log_widths(reach.tube) - _log_widths(again.tube)).mean()) > max(gain, _WORTH):
-                    division, more = more, None
+                    reach, division, more = again, more, None
                     continue
             if not gain > (_WORTH if halvings else 0.0):
                 break
             cells, halvings, more = halved(cells, states), halvings + 1, None
+            if halvings < most_halvings:
+                reach = self.reach(first, cells, division)
         return cells, division
 
     def coarse(self, piece: Piece) -> bool:
         """Whether more parts would help: a tube that explodes does so for other reasons if remainders are small."""
         return bool((remainder_share(piece.reach) > (FINE if piece.bounded else ENOUGH)).any())
 
-    def piece(self, cells: Box, division: Division, *, foresee: bool = False) -> Piece:
+    def piece(self, cells: Box, division: Division) -> Piece:
         """Cells bounded and judged."""
-        reach = self.reach(self.loop, cells, division, foresee=foresee)
+        reach = self.reach(self.loop, cells, division)
         return Piece(cells, reach, judged(reach, self.asked, self.loop, self.w))
 
-    def reach(self, loop: SampledLoop, cells: Box, division: Division, *, foresee: bool) -> Reach:
-        """Cells bounded, all periods or the first ones."""
+    def reach(self, loop: SampledLoop, cells: Box, division: Division) -> Reach:
+        """Cells bounded, all periods or the first ones, and what halving them would do, which costs next to nothing."""
         return _joined(
             [
                 reach_continuously(
@@ -370,7 +372,7 @@ class _Work:
                     self.w,
                     substeps=division.substeps,
                     order=division.order,
-                    foresee=foresee,
+                    foresee=True,
                 )
                 for low, high in zip(cells.lower.split(self.at_once), cells.upper.split(self.at_once), strict=True)
             ]
@@ -378,15 +380,23 @@ class _Work:
 
     def halved(self, piece: Piece, division: Division) -> Piece | None:
         """The halves of all cells, each in the state whose halves are foreseen to miss least; None if one cannot be."""
-        reach = piece.reach  # the first cells were not asked what halving would do: most often they are enough
-        reach = self.reach(self.loop, piece.cells, division, foresee=True) if reach.halves is None else reach
+        reach = piece.reach
         assert reach.halves is not None
 
         def missing(tube: Tube) -> Tensor:
             return foreseen_missing(tube, self.asked, self.loop)
 
         cut = best_cut(piece.cells, reach.tube, reach.halves, missing)
-        return None if bool((cut < 0).any()) else self.piece(halved(piece.cells, cut), division, foresee=True)
+        return None if bool((cut < 0).any()) else self.piece(halved(piece.cells, cut), division)
+
+
+def _first(reach: Reach, periods: int) -> Reach:
+    """The tubes of the first periods alone, and what halving would do to them."""
+    tube, halves = reach.tube, reach.halves
+    assert halves is not None
+    steps = slice(periods + 1)
+    cut = Halves(halves.shift[:, :, steps], halves.narrowing[:, :, steps])
+    return Reach(Tube(tube.lower[:, steps], tube.upper[:, steps]), halves=cut)
 
 
 def _log_widths(tube: Tube) -> Tensor:
