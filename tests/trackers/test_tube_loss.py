@@ -35,8 +35,8 @@ def loss_of(loss, tracker, unicycle, references, start, disturbance, *, share=1.
 
 @torch.no_grad()
 def tube_of_forms(loop, start, disturbance):
-    """The tube that has a gradient: no end of it is one that an interval decides."""
-    return Affine().run(loop, start, disturbance, intervals=False).tube
+    """The tube that has a gradient, as the loss takes it: no end is one that an interval decides, nothing is boxed."""
+    return Affine(symbols=10_000).run(loop, start, disturbance, intervals=False).tube
 
 
 def test_at_full_size_with_one_cell_it_is_the_log_width_of_the_tube_of_forms(
