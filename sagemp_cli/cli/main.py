@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
 from sagemp_cli import __version__
 from sagemp_cli.cli import (
-    build_library,
     check,
     config,
     doctor,
-    execute,
     export,
     init,
     inspect,
@@ -25,7 +24,7 @@ from sagemp_cli.cli import (
 )
 from sagemp_cli.cli.command import add_command, errors_as_lines, examples
 from sagemp_cli.cli.completion import PIPELINE
-from sagemp_cli.cli.plain_stages import PLAIN, function_of
+from sagemp_cli.cli.plain_stages import PREPARING, USING, PlainStage, function_of
 from sagemp_cli.cli.stages_from_outside import Commands
 
 app = typer.Typer(
@@ -45,12 +44,16 @@ app = typer.Typer(
 )
 
 _PIPELINE, _AROUND = PIPELINE, "Around it"
-for _stage in PLAIN:
-    add_command(app, _stage.name, function_of(_stage.name), help=_stage.help, epilog=_stage.epilog, panel=_PIPELINE)
+
+
+def _plain(stage: PlainStage) -> tuple[str, Callable[..., None], str, str]:
+    return stage.name, function_of(stage), stage.epilog, _PIPELINE
+
+
 for _name, _function, _examples, _panel in (
+    *map(_plain, PREPARING),
     ("verify", verify.verify, verify.EXAMPLES, _PIPELINE),
-    ("build-library", build_library.build_library, build_library.EXAMPLES, _PIPELINE),
-    ("execute", execute.execute, execute.EXAMPLES, _PIPELINE),
+    *map(_plain, USING),
     ("safety-rates", safety_rates.safety_rates, safety_rates.EXAMPLES, _PIPELINE),
     ("init", init.init, init.EXAMPLES, _AROUND),
     ("run", run.run, run.EXAMPLES, _AROUND),

@@ -1,4 +1,4 @@
-"""The commands of stages that write a file and nothing else, with the seed that is the root of all: one function."""
+"""The commands of stages that write a file and print nothing of it: one function."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from sagemp_cli.cli.command import examples
-from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, Seed, TimeLimit, overrides_of
+from sagemp_cli.cli.options import DryRun, Overrides, Overwrite, Partitions, SampleSeed, Seed, TimeLimit, overrides_of
 from sagemp_cli.cli.stage_command import run_stage
 
 
 @dataclass(frozen=True)
 class PlainStage:
-    """Name, help (paragraphs) and examples of the command of a stage."""
+    """The command of a stage: its name, help (paragraphs) and examples.
+
+    ``seed_of`` is the section whose seed ``--seed`` is, empty for the root of all; ``partitions`` says whether the
+    stage takes ``--partitions``.
+    """
 
     name: str
     help: str
     examples: tuple[str, ...]
+    seed_of: str = ""
+    partitions: bool = False
 
     @property
     def epilog(self) -> str:
@@ -26,7 +32,7 @@ class PlainStage:
         return examples(*self.examples)
 
 
-PLAIN = (
+PREPARING = (
     PlainStage(
         "gen-data",
         "Expert demonstrations by trajectory optimisation.\n\n"
@@ -70,6 +76,31 @@ PLAIN = (
         ),
     ),
 )
+USING = (
+    PlainStage(
+        "build-library",
+        "Collect certified references of the planner (Algorithm 2).\n\n"
+        "Reads planner.h5 and tracker.h5 and writes library.h5; rejected references are counted by reason.",
+        (
+            "sagemp build-library",
+            "sagemp build-library library.size=20 library.budget=200",
+            "sagemp build-library --partitions 2x2",
+        ),
+        seed_of="library",
+        partitions=True,
+    ),
+    PlainStage(
+        "execute",
+        "Track the closest certified reference (Algorithm 3).\n\n"
+        "Reads library.h5, plans afresh from measured starts, rolls out under disturbances and writes rollouts.h5.",
+        (
+            "sagemp execute",
+            "sagemp execute execute.queries=10 execute.rollouts=100 --seed 3",
+            "sagemp execute --dry-run",
+        ),
+        seed_of="execute",
+    ),
+)
 
 
 def from_outside(name: str, function: Callable[..., Any]) -> PlainStage:
@@ -78,17 +109,28 @@ def from_outside(name: str, function: Callable[..., Any]) -> PlainStage:
     return PlainStage(name, inspect.getdoc(function) or f"Make {name}.h5.", shown)
 
 
-def function_of(stage: str) -> Callable[..., None]:
-    """What the command of a stage does, with its options."""
+def function_of(stage: PlainStage) -> Callable[..., None]:
+    """What the command of a stage does; its parameters are its options."""
 
     def make(
         overrides: Overrides = None,
+        partitions: Partitions = None,
         seed: Seed = None,
         overwrite: Overwrite = False,
         dry_run: DryRun = False,
         time_limit: TimeLimit = None,
     ) -> None:
-        given = overrides_of(overrides, seed=seed)
-        run_stage(stage, given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit)
+        given = overrides_of(overrides, seed=seed, seed_of=stage.seed_of, partitions=partitions)
+        run_stage(stage.name, given, overwrite=overwrite, dry_run=dry_run, seconds=time_limit)
 
+    signature = inspect.signature(make, eval_str=True)
+    options = dict(signature.parameters)
+    if not stage.partitions:
+        del options["partitions"]
+    if stage.seed_of:
+        options["seed"] = options["seed"].replace(annotation=SampleSeed)
+    make.__doc__ = stage.help
+    # Typer reads both, and the docstring is the help.
+    make.__signature__ = signature.replace(parameters=list(options.values()))  # pyright: ignore[reportFunctionMemberAccess]
+    make.__annotations__ = {name: option.annotation for name, option in options.items()}
     return make

@@ -39,5 +39,5 @@ class Commands(TyperGroup):
 
 def _command(name: str, function: Any) -> Any:
     alone, stage = typer.Typer(add_completion=False, rich_markup_mode="rich"), from_outside(name, function)
-    add_command(alone, name, function_of(name), help=stage.help, epilog=stage.epilog, panel=PIPELINE)
+    add_command(alone, name, function_of(stage), help=stage.help, epilog=stage.epilog, panel=PIPELINE)
     return typer.main.get_command(alone)
