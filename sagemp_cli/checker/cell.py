@@ -145,7 +145,7 @@ class _Parts:
         n, m = ode.rate.states, ode.controls
         control, begin, held = asked[:m], box[:n], box[n:]
         inner, jumps, less = _cut(asked[m:], [n * (ode.substeps - 1), n * ode.lagged])
-        if lag is not None and ode.jitters and k:
+        if lag is not None and ode.jitters:
             self._prover.measured(flow, k, lag.since(ode.period, ode.substeps), held)
         self._begins, self._control, self._insides = [begin], control, []
         for j in range(self._count):

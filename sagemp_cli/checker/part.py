@@ -138,13 +138,18 @@ class PartProver:
         return inside
 
     def measured(self, claim: FlowClaim, k: int, since: int, control: Column) -> None:
-        """Prove what is left out of the state that is measured at the end of period k - 1, under the control of then.
+        """Prove what is left out of the state that is measured at the end of period k - 1, under the control of then:
+        of the first state, which is measured at once, nothing.
 
         Raises:
             Unproved: it does not follow.
         """
         lag = self._flow.lag
         assert lag is not None
+        if not k:
+            if not ((claim.measured_lower[0] <= 0) & (claim.measured_upper[0] >= 0)).all():
+                raise Unproved("of the first measured state, which is that of its instant, something is left out")
+            return
         n = claim.lower.shape[2]
         sides = claim.lower[k - 1, since:].min(axis=0), claim.upper[k - 1, since:].max(axis=0)
         stay = list(zip(*map(balls, sides), strict=True))

@@ -120,22 +120,25 @@ def of_scene(scene: Scene, position: Sequence[int]) -> tuple[Requirement, ...]:
     """What a scene asks for: within the workspace and clear of obstacles always, in the goal at the end."""
     found: list[Requirement] = []
     if scene.workspace.has_faces:
-        found.append(Inside(_bounds(scene.workspace, position), name="workspace"))
+        found.append(Inside(_of_box(scene.workspace, position), name="workspace"))
     for obstacle in scene.obstacles:
         if isinstance(obstacle, Block):
-            box = Box(torch.tensor(obstacle.lower), torch.tensor(obstacle.upper))
-            found.append(Outside(_bounds(box, position), name=obstacle.name))
+            found.append(Outside(_bounds(obstacle.lower, obstacle.upper, position), name=obstacle.name))
         else:
             found.append(
                 Holds(functools.partial(_distance, obstacle, tuple(position)), name=obstacle.name, strict=True)
             )
     if scene.goal.has_faces:
-        found.append(Inside(_bounds(scene.goal, range(scene.goal.dim)), when="end", name="goal"))
+        found.append(Inside(_of_box(scene.goal, range(scene.goal.dim)), when="end", name="goal"))
     return tuple(found)
 
 
-def _bounds(box: Box, states: Sequence[int]) -> Bounds:
-    return {i: (low, high) for i, low, high in zip(states, box.lower.tolist(), box.upper.tolist(), strict=True)}
+def _of_box(box: Box, states: Sequence[int]) -> Bounds:
+    return _bounds(box.lower.tolist(), box.upper.tolist(), states)
+
+
+def _bounds(lower: Sequence[float], upper: Sequence[float], states: Sequence[int]) -> Bounds:
+    return {i: (low, high) for i, low, high in zip(states, lower, upper, strict=True)}
 
 
 def _distance(ball: Ball, position: tuple[int, ...], x: Any) -> Any:

@@ -14,6 +14,7 @@ from sagemp_cli.errors import ArtifactError, UsageError
 from sagemp_cli.pipeline.against import differences
 from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
+from sagemp_cli.reachability.continuous import propagation
 from sagemp_cli.sets import Box
 from sagemp_cli.stages.export_monitor import export_monitor
 from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
@@ -93,6 +94,7 @@ def bounds(delay, jitter):
         (put("curve", (0, 1, 0, 0), lambda v: v * 0.3), "cell 0, step 1: part 0: the path of state 0 may bend more"),
         (put("measured_upper", (1, 2, 0), lambda v: v * 0.1 - 1e-9), "step 2: what is left out of the measured state"),
         (put("measured_lower", (0, 1, 1), lambda v: 1e-9), "step 1: what is left out of the measured state 1"),
+        (put("measured_upper", (0, 0, 0), lambda v: -1e-300), "cell 0, step 0: of the first measured state"),
         (put("measured_lower", (0, 1, 1), lambda v: np.nan), "finite"),
         (put("jump", (0, 1, 0, 0), lambda v: np.inf), "finite"),
         (bounds([0.0, 0.13], [0.005, 0.02]), ""),
@@ -107,6 +109,26 @@ def test_what_is_not_so_is_not_proved(change, message, path, mutate, tmp_path):
 
 def without(name):
     return lambda file: file.__delitem__(name)
+
+
+def test_a_loop_whose_first_state_is_measured_wrong_is_not_the_one_that_is_claimed(tmp_path, monkeypatch):
+    """The sets are right for it, and so are their relaxations: what is wrong is one number of the file."""
+    lagging, wrong = propagation._lagging, 0.02
+
+    def forged(given, shares, guess, side):
+        guess = guess.clone()
+        guess[shares.jitter[1] == 0, :, -1] = wrong
+        return lagging(given, shares, guess, side)
+
+    monkeypatch.setattr(propagation, "_lagging", forged)
+    case = flow_case(tmp_path / "certificate.h5", horizon=3, lag=lag((0.0, 0.12), (0.005, 0.02)), checked=False)
+    flow = case.certificate.tubes.flow
+    sides = {name: getattr(flow, name).copy() for name in ("measured_lower", "measured_upper")}
+    for side in sides.values():
+        assert not side[:, 0].any()
+        side[:, 0] = wrong
+    report = check(case.write(tmp_path / "forged.h5", flow=dataclasses.replace(flow, **sides)))
+    assert report.answer == "UNKNOWN" and "step 0: of the first measured state" in report.findings[0].reason
 
 
 @pytest.mark.parametrize("name", ["data/tubes/flow/jump", "data/tubes/flow/measured_upper"])

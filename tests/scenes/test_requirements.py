@@ -61,6 +61,14 @@ def test_what_cannot_be_required_is_refused_in_one_line(requirement, says):
     assert "\n" not in str(error.value)
 
 
+def test_a_scenes_faces_are_required_as_they_are():
+    """Not as float32 rounds them: an obstacle would be smaller than it is."""
+    low, high = (0.1, 1000.1), (0.3, 1000.7)
+    box = Box(*(torch.tensor(side, dtype=torch.float64) for side in (low, high)))
+    for required in of_scene(Scene(box, (Block(low, high, "wall"),), box), (0, 1)):
+        assert required.bounds == {0: (0.1, 0.3), 1: (1000.1, 1000.7)}
+
+
 def test_a_scene_is_requirements():
     ends = [torch.tensor([s * 5.0, s * 5.0], dtype=torch.float64) for s in (-1, 1)]
     goal = Box(torch.tensor([1.0, -math.inf, -math.inf]), torch.tensor([2.0, math.inf, math.inf]))
