@@ -60,11 +60,12 @@ class _Exact(Tensor):
     def __torch_function__(cls, function: Any, types: Sequence[type], args: Any = (), kwargs: Any = None) -> Any:
         with torch._C.DisableTorchFunctionSubclass():
             kwargs = kwargs or {}
-            if contains((args, kwargs), cls, float32=True):
-                _ROUNDED[0] = True
-            else:
-                args = widened(tuple(args))
-                kwargs = {key: widened(value) for key, value in kwargs.items()}
+            if kwargs or not _wide(args):
+                if contains((args, kwargs), cls, float32=True):
+                    _ROUNDED[0] = True
+                else:
+                    args = widened(tuple(args))
+                    kwargs = {key: widened(value) for key, value in kwargs.items()}
             if types == (cls,):  # what torch itself does then, without its detours
                 result = function(*args, **kwargs)
                 return result if function in _NOT_WRAPPED else cls._wrapped(result)
@@ -77,6 +78,20 @@ class _Exact(Tensor):
         if isinstance(result, (list, tuple)):
             return type(result)(cls._wrapped(one) for one in result)
         return result
+
+
+def _wide(values: Sequence[Any]) -> bool:
+    """Whether all tensors among arguments are float64: what most calls are, and quickly told."""
+    for value in values:
+        if isinstance(value, Tensor):
+            if value.dtype is not torch.float64:
+                return False
+        elif isinstance(value, (list, tuple)):
+            if not _wide(value):
+                return False
+        elif isinstance(value, dict):
+            return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -135,6 +150,9 @@ class Step:
         return result
 
     def _plain(self, result: Any, shape: torch.Size) -> Tensor:
+        if type(result) is _Exact:
+            with torch._C.DisableTorchFunctionSubclass():  # reads no attribute by way of the class
+                result = result.as_subclass(Tensor)
         check_state(result, shape)
         plain = result.detach().as_subclass(Tensor)
         if plain.dtype.is_complex or plain.dtype is torch.bool:
