@@ -111,7 +111,7 @@ def check_document(
     tubes, true = document.tubes, None
     work = processes, progress or Silent()
     with ctx.workprec(BITS):
-        problems = [*_problems(document, safe, sets), *_unrecorded(document)]
+        problems = [*_problems(document, sets), *_unrecorded(document)]
         found = _findings(document, safe, *work, sound=not problems)
         replayed = () if problems else _replayed(document, safe, sets)
         falsified = document.verdict == "FALSIFIED" and _falsified(document, replayed)
@@ -153,7 +153,7 @@ def recheck(path: Path) -> str:
     document = read_document(path)
     safe, sets = document.safe, document.sets
     with ctx.workprec(BITS):
-        for problem in _problems(document, safe, sets):
+        for problem in _problems(document, sets):
             return problem
         for part in (document, *([] if document.true_model is None else [document.true_model])):
             tubes = part.tubes
@@ -184,24 +184,22 @@ def _findings(
     return tuple(_finding(document, r, reasons.get(r), margins.get(r)) for r in range(count))
 
 
-def _problems(document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]) -> Iterator[str]:
+def _problems(document: Document, sets: tuple[SetOfConfig, SetOfConfig]) -> Iterator[str]:
     """What is wrong with the claim as a whole: W, X_I, finite numbers, and the verdict of all."""
-    yield from _problems_of_tubes(document, safe, sets)
+    yield from _problems_of_tubes(document, sets)
     follows = _answer(document.tubes["verdict"])
     if document.kind == "certificate" and document.verdict != follows:
         yield f"the verdict is {document.verdict}, but {follows} follows from those of the references"
     true = document.true_model
     if true is not None:
-        yield from (f"the analytical model: {problem}" for problem in _problems_of_tubes(true, safe, sets))
+        yield from (f"the analytical model: {problem}" for problem in _problems_of_tubes(true, sets))
         if not np.array_equal(true.tubes["references"], document.tubes["references"]):
             yield "the analytical model: its references are others than the robot's"
         if len(document.programs) != 1 or not true.programs[0].is_deviating(document.programs[0]):
             yield "the analytical model: its step is not that of the network with the deviation added to w"
 
 
-def _problems_of_tubes(
-    document: Document, safe: SafeSet, sets: tuple[SetOfConfig, SetOfConfig]
-) -> Iterator[str]:  # fmt: skip
+def _problems_of_tubes(document: Document, sets: tuple[SetOfConfig, SetOfConfig]) -> Iterator[str]:
     """The same of one claim, without the verdict of all."""
     tubes = document.tubes
     for name in ("references", "start_lower", "start_upper", "cell_lower", "cell_upper"):

@@ -26,8 +26,6 @@ from sagemp_cli.stages.prove import claim_of, corners, scene_data
 from sagemp_cli.storage import Header, refuse_existing, write_artifact
 from sagemp_cli.verification.continuous.proof import OdeProof, verify_ode
 
-Pairs = Sequence[tuple[float, float]]
-
 
 @dataclass(frozen=True)
 class Plant:

@@ -242,11 +242,11 @@ class Series:
 
     def _tanh(self, slot: int, i: Instruction, q: int) -> int | None:
         """``t' = (1 - t^2) a'``."""
-        return self._squared_slope(slot, i, q, slope=lambda t, square: self._one_less(t, square, q, -1.0))
+        return self._squared_slope(slot, i, q, slope=lambda _, square: self._one_less(square, q, -1.0))
 
     def _tan(self, slot: int, i: Instruction, q: int) -> int | None:
         """``t' = (1 + t^2) a'``."""
-        return self._squared_slope(slot, i, q, slope=lambda t, square: self._one_less(t, square, q, 1.0))
+        return self._squared_slope(slot, i, q, slope=lambda _, square: self._one_less(square, q, 1.0))
 
     def _sigmoid(self, slot: int, i: Instruction, q: int) -> int | None:
         """``s' = (s - s^2) a'``."""
@@ -268,7 +268,7 @@ class Series:
         a = self._values[i.operands[0]]
         under, slope = self.series_beside("under", slot), self.series_beside("slope", slot)
         square = self._cauchy(a, a, q)
-        under.append(self._one_less(None, square, q, 1.0))
+        under.append(self._one_less(square, q, 1.0))
         if q == 0:
             slope.append(self._out.of("reciprocal", _there(under[0])))
             return self._out.made(i, [_there(a[0])])
@@ -327,7 +327,7 @@ class Series:
         rest = self._times(self._cauchy(power, found, q, 1, q), found[0])
         return None if rest is None else self._out.of("neg", rest)
 
-    def _one_less(self, t: int | None, square: int | None, q: int, sign: float) -> int | None:
+    def _one_less(self, square: int | None, q: int, sign: float) -> int | None:
         """Coefficient of ``1 + sign square``."""
         if q == 0:
             size = self._out.size(_there(square))

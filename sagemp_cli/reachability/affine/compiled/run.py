@@ -220,11 +220,6 @@ class Ready:
         return self._next(k, frame, results), watched, operands
 
     @property
-    def watches(self) -> bool:
-        """Whether the loop says its controls or deviations."""
-        return self._watched is not None
-
-    @property
     def nodes(self) -> list[Node]:
         """The nonlinear operations, in the order of evaluation."""
         return [node for node, _ in self._nodes]
