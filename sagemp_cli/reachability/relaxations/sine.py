@@ -42,6 +42,7 @@ _TWO_PI = 2.0 * math.pi
 _NARROW = 0.05  # rad: below, what an inflection costs (a third-order term) is not worth the time
 _WIDE = 2.5  # rad: above, the slope is searched
 _FAR = 2.0**40  # rad: beyond, rounding of the argument leaves nothing but [-1, 1]
+_SURE = 2.0**30  # rad: up to here turns are computed to less than _SLACK, so that no extremum inside is missed
 
 
 class _Wave(NamedTuple):
@@ -126,12 +127,12 @@ def cosine_lines(lower: Tensor, upper: Tensor) -> Lines:
 
 
 def sine_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds of ``sin`` on ``[lower, upper]``."""
+    """Bounds of ``sin`` on ``[lower, upper]``; [-1, 1] beyond some 10^9 rad."""
     return _range(_SINE, lower, upper)
 
 
 def cosine_range(lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds of ``cos`` on ``[lower, upper]``."""
+    """Bounds of ``cos`` on ``[lower, upper]``; [-1, 1] beyond some 10^9 rad."""
     return _range(_COSINE, lower, upper)
 
 
@@ -177,7 +178,7 @@ def _range(wave: _Wave, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     m = functions_of(lower)
     ends, zero = m.stack([lower, upper]), m.zeros_like(lower)
     tops, bottoms, _ = _extrema(wave, zero, ends, wave.value(ends))
-    near = m.amax(abs(ends), 0) <= _FAR
+    near = m.amax(abs(ends), 0) <= _SURE
     margin = _margin(zero)
     return (
         m.where(near, m.clamp(m.amin(bottoms, 0) - margin, min=-1.0), -1.0),
