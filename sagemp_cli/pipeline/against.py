@@ -153,7 +153,7 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
         yield Difference("step", "the network in the file", "a network learned from the formulas", covers=True)
         return
     if document.ode is not None:
-        yield from _lag(document.ode.lag, robot.control_lag)
+        yield from lag_differences(document.ode.lag, robot.control_lag)
         yield from _rate(document, document.ode.rate, model)
         return
     program = (document if true is None else true).programs[0]
@@ -182,7 +182,7 @@ def _model(document: Document, robot: Dynamics) -> Iterator[Difference]:
         yield _another("step", worst)
 
 
-def _lag(proved: Proved | None, asked: Lag) -> Iterator[Difference]:
+def lag_differences(proved: Proved | None, asked: Lag) -> Iterator[Difference]:
     """How late a control may be, beside how late it is said to be."""
     for name in ("delay", "jitter"):
         one, other = (0.0, 0.0) if proved is None else getattr(proved, name), getattr(asked, name)

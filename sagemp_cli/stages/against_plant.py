@@ -13,8 +13,9 @@ from sagemp_cli.checker.check import Report, sides
 from sagemp_cli.checker.document import Document
 from sagemp_cli.checker.points import outputs_at
 from sagemp_cli.checker.program import Program
+from sagemp_cli.dynamics.lag import Lag
 from sagemp_cli.errors import UsageError
-from sagemp_cli.pipeline.against import Difference
+from sagemp_cli.pipeline.against import Difference, lag_differences
 from sagemp_cli.scenes.requirements import Formula
 from sagemp_cli.sets import Box
 from sagemp_cli.stages.prove_ode import Plant
@@ -27,9 +28,10 @@ _TOLERANCE = 1e-9
 def plant_differences(report: Report, plant: Plant) -> list[Difference]:
     """What differs between a checked file and a robot.
 
-    Sets, period and horizon are compared exactly; a wider X_I or W than asked for covers it. Functions, those of the
-    requirements too, are compared with the file's programs at points of the tube, which finds differences and proves
-    nothing.
+    Sets, period and horizon are compared exactly; a wider X_I or W than asked for covers it. The control of such a
+    robot is of its state alone and there at once: a file about one that is always late does not say so. Functions,
+    those of the requirements too, are compared with the file's programs at points of the tube, which finds differences
+    and proves nothing.
 
     Raises:
         UsageError: the file is not about an ODE, or a function fails.
@@ -52,8 +54,13 @@ def plant_differences(report: Report, plant: Plant) -> list[Difference]:
             found.append(Difference("period", f"{document.dt!r} s", f"{plant.period!r} s", covers=False))
         if plant.horizon != document.horizon:
             found.append(Difference("K", str(document.horizon), str(plant.horizon), covers=False))
+        found += lag_differences(document.ode.lag, Lag())
         points = _points(document)
-        found += _function("control", document.programs[0], points, plant.control, numbers=False)
+        if document.lookahead:
+            proved = f"of the state and of {document.lookahead} points of a reference"
+            found.append(Difference("control", proved, "of the state alone", covers=False))
+        else:
+            found += _function("control", document.programs[0], points, plant.control, numbers=False)
         found += _function("ODE", document.ode.rate, points, plant.rate, numbers=True)
         for requirement in plant.requirements:
             formula = requirement.formula(names)

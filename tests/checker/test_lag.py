@@ -16,7 +16,9 @@ from sagemp_cli.pipeline.tubes import counterexample_record, tubes_record
 from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.continuous import propagation
 from sagemp_cli.sets import Box
+from sagemp_cli.stages.against_plant import plant_differences
 from sagemp_cli.stages.export_monitor import export_monitor
+from sagemp_cli.stages.prove_ode import Plant
 from sagemp_cli.verification.attack.refutation import FalsifierOptions, attack
 from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verification import verify_references
@@ -203,6 +205,31 @@ def test_what_the_attack_refutes_under_a_lag_the_checker_refutes(tmp_path):
 )
 def test_a_verdict_says_how_late_a_control_may_be(delay, jitter, words):
     assert lag_words([delay, jitter]) == words
+
+
+@pytest.mark.parametrize(
+    ("late", "missing"), [(((0.0, 0.05), (0.0, 0.02)), []), (((0.05, 0.05), (0.01, 0.02)), ["delay", "jitter"])]
+)
+def test_a_robot_whose_control_is_there_at_once_is_not_one_that_is_always_late(late, missing, tmp_path):
+    (least, most), (newest, oldest) = late
+    case = flow_case(tmp_path / "certificate.h5", horizon=3, lag=lag((least, most), (newest, oldest)))
+    sides = Box(*(torch.tensor(case.config["start"][side], dtype=torch.float64) for side in ("lower", "upper")))
+    loop = case.loop
+    plant = Plant(loop.rate, lambda x: loop.control_given(None, x), 0.2, 3, sides, case.disturbance, None, ())
+    report = check(tmp_path / "certificate.h5")
+    assert report.answer == "VERIFIED"
+    found = plant_differences(report, plant)
+    assert {d.what for d in found} == {"delay", "jitter"}
+    assert [d.what for d in found if not d.covers] == missing
+
+
+def test_a_control_that_looks_ahead_is_not_one_of_the_state_alone(tmp_path):
+    case = make_case(time="continuous")
+    report = check(case.write(tmp_path / "certificate.h5"))
+    start = Box(*(torch.from_numpy(getattr(case.tubes, f"start_{side}")[0]) for side in ("lower", "upper")))
+    plant = Plant(lambda x, u: x + u[..., :1], lambda x: x, 0.05, 8, start, None, None, ())
+    found = {d.what: (d.covers, d.proved) for d in plant_differences(report, plant)}
+    assert found["control"][0] is False and "points of a reference" in found["control"][1]
 
 
 def test_a_monitor_of_older_states_is_refused(path, tmp_path):
