@@ -165,14 +165,22 @@ class Monitor:
         if late is not None:
             return late
         if k == 0:
-            held = ((self._cells[0] - self.error <= x) & (x <= self._cells[1] + self.error)).all(-1)
+            held, exact = self._held(x, self.error), not self.error.any()
+            if not held.any():  # beside a face by rounding, it may be in any of the cells there
+                held, exact = self._held(x, self.error + _rounding(x)), False
             if not held.any():
-                return self._outside(Cause.START, x, self._cells[0].min(0), self._cells[1].max(0))
-            if not self.error.any():  # exactly known: it is in the tubes of all the cells that it is in
+                low, high = self._cells[0].min(0), self._cells[1].max(0)
+                return self._outside(Cause.START, x, low, high) or self._of(Cause.START, "", np.inf, "between cells")
+            if exact:  # exactly known: it is in the tubes of all the cells that it is in
                 self._low, self._high = self._tubes[0][held].max(0), self._tubes[1][held].min(0)
             else:  # it may be in any of them
                 self._low, self._high = self._tubes[0][held].min(0), self._tubes[1][held].max(0)
         return self._outside(Cause.OUTSIDE, x, self._low[k], self._high[k])
+
+    def _held(self, x: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """The cells that a state may be in, ``(C,)``."""
+        inside = (self._cells[0] - error <= x) & (x <= self._cells[1] + error)
+        return np.asarray(inside.all(-1))
 
     def _late(self, time: float | None) -> Alarm | None:
         if time is None:
@@ -193,7 +201,7 @@ class Monitor:
     def _outside(self, cause: Cause, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Alarm | None:
         """The coordinate that is farthest outside, relative to the width of its bounds."""
         off = np.maximum(low - x, x - high) - self.error
-        rounding = 1e-9 * (1.0 + np.abs(x))  # of computing the state; the tube holds in real arithmetic
+        rounding = _rounding(x)
         if not (off > rounding).any():
             return None
         width = np.where(np.isfinite(high - low), high - low, 1.0)
@@ -203,6 +211,11 @@ class Monitor:
 
     def _of(self, cause: Cause, name: str, size: float, why: str) -> Alarm:
         return Alarm(cause, self._step, name, size, f"step {self._step}: {cause.value}: {why}")
+
+
+def _rounding(x: np.ndarray) -> np.ndarray:
+    """Of computing the state; the tube holds in real arithmetic."""
+    return 1e-9 * (1.0 + np.abs(x))
 
 
 def _numbers(value: Any) -> np.ndarray | None:

@@ -54,6 +54,18 @@ def test_a_start_in_one_cell_has_that_cells_tube_and_one_on_a_face_both():
     assert seen(made(), [[1.0, 0.0], [2.0, 0.0]]) is None
 
 
+def test_a_start_beside_a_face_by_rounding_has_the_tubes_there():
+    """Computed, not measured: a corner of X_I that rounding put outside of all cells."""
+    assert seen(made(), [[0.5 + k, -1.0 - 1e-12] for k in range(4)]) is None
+    assert seen(made(), [[2.0 + 1e-12, 0.0], [1.5, 0.0]]).step == 1
+
+
+def test_a_start_between_the_cells_is_an_alarm_at_once():
+    low, high = np.zeros((2, 2, 1)), np.ones((2, 2, 1))
+    apart = Monitor(low, high, np.array([[0.0], [0.75]]), np.array([[0.25], [1.0]]), ("x",))
+    assert seen(apart, [[0.5]]).cause is Cause.START
+
+
 def test_a_start_outside_of_every_cell_is_an_alarm_at_once():
     alarm = seen(made(), [[2.5, 0.0]])
     assert (alarm.cause, alarm.step, alarm.coordinate, alarm.size) == (Cause.START, 0, "px", 0.5)
