@@ -16,6 +16,9 @@ from sagemp_cli.errors import NonFiniteError, UnsupportedOperationError
 from sagemp_cli.reachability.program.constants import exact_parts
 from sagemp_cli.reachability.program.value import Traced, answers, exact, ids_of, is_tensor, recorder_of, unsupported
 
+SOFTPLUS_LARGEST = 87.0
+"""Threshold of a softplus in float32, below that of overflow: exp(87) is 2^125.5."""
+
 
 def elementwise(kind: str, *operands: Any, name: str = "", limits: Sequence[Any] = (), numbers: Sequence[float] = ()):
     """An instruction on values, constants and numbers, entry by entry, which are broadcast.
@@ -182,6 +185,11 @@ def softplus(x: Traced, beta: float = 1.0, threshold: float = 20.0) -> Traced:
     """Softplus."""
     if not beta > 0:
         raise UnsupportedOperationError(f"softplus is supported with a positive beta, found {beta}")
+    if x.recorder.float32 and threshold > SOFTPLUS_LARGEST:
+        raise UnsupportedOperationError(
+            f"softplus in float32 is supported with a threshold of at most {SOFTPLUS_LARGEST:g}, found {threshold}: "
+            f"beyond, its exponential may overflow"
+        )
     return elementwise("softplus", x, numbers=(beta, threshold))
 
 

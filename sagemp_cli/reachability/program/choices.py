@@ -80,7 +80,8 @@ def where(condition: Any, a: Any, b: Any) -> Traced:
     """The first value where the condition is true, else the second.
 
     A branch with a function that is not defined everywhere is computed of what is compared, cut to where the branch
-    counts: with ``x > k``, ``sqrt(x)`` of ``max(x, k)``, which is the same there.
+    counts: with ``x > k``, ``sqrt(x)`` of ``max(x, k)``, which is the same there. Every entry has a condition of its
+    own, so a branch whose entries depend on what is compared for others is left as it is.
     """
     if _is_truth(a) and not _is_truth(condition):  # as a method
         condition, a = a, condition
@@ -99,7 +100,7 @@ def where(condition: Any, a: Any, b: Any) -> Traced:
     olds = torch.cat([v.ids.reshape(-1) for v in (c, *cut[:1])])
     for_yes = torch.cat([v.ids.reshape(-1) for v in (elementwise("relu", c), *cut[1:2])])
     for_no = torch.cat([v.ids.reshape(-1) for v in (clamp(c, None, 0.0), *cut[2:])])
-    return elementwise("where", c, _within(yes, olds, for_yes), _within(no, olds, for_no))
+    return elementwise("where", c, _within(yes, c, olds, for_yes), _within(no, c, olds, for_no))
 
 
 def _is_truth(value: Any) -> bool:
@@ -134,12 +135,15 @@ def _cut(c: Traced) -> tuple[Traced, ...]:
     return (x, above, below) if signs[0] > 0 else (x, below, above)
 
 
-def _within(value: Any, olds: Tensor, news: Tensor) -> Any:
+def _within(value: Any, condition: Traced, olds: Tensor, news: Tensor) -> Any:
     """A branch computed of other values, if it has a function that is not defined everywhere."""
     if not isinstance(value, Traced):
         return value
-    ids, kinds = value.recorder.replaced(value.ids, olds, news)
-    return value._like(ids) if set(kinds) & set(_PARTIAL) else value
+    shape = torch.broadcast_shapes(value.shape, condition.shape)
+    ids, own = value.ids.expand(shape), condition.ids.expand(shape)
+    of = condition.ids.reshape(-1).repeat(len(olds) // condition.numel())
+    found = value.recorder.replaced(ids, olds, news, own=own, of=of)
+    return value._like(found[0]) if found is not None and set(found[1]) & set(_PARTIAL) else value
 
 
 @answers("masked_fill")

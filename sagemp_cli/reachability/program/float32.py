@@ -41,8 +41,8 @@ _KNOWN = frozenset(_WORDS.split())
 CONVERSIONS = ("to", "float", "type", "type_as")
 """Functions that may make float32 values of others."""
 
-_SHAPED = ("expand_as", "view_as", "reshape_as")
-"""Functions that look at the shape of another value only."""
+_SHAPED = ("expand_as", "view_as", "reshape_as", "broadcast_tensors")
+"""Functions that look at the shapes of other values only."""
 
 _SMALLEST = 2.0**-126
 
@@ -88,6 +88,11 @@ def as_float32(value: Any, name: str) -> Any:
         return type(value)([as_float32(one, name) for one in value])
     if isinstance(value, np.ndarray):
         raise UnsupportedOperationError(f"'{name}' of a float32 value and a numpy array; make it a float32 tensor")
+    if name.startswith("pow") and not _held(value):
+        raise UnsupportedOperationError(
+            f"'{name}' of a float32 value and the exponent {value}, which is no float32 number: torch takes it as "
+            f"rounded to float32 for some entries and as it is for others"
+        )
     if isinstance(value, (float, np.floating)):
         return float(_narrowed(torch.tensor(float(value), dtype=torch.float64), name))
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 2**24:
@@ -110,6 +115,13 @@ def mixed(name: str) -> UnsupportedOperationError:
     return UnsupportedOperationError(
         f"torch operation '{name}' mixes float32 and float64 and gives float32; convert with .float() or .double()"
     )
+
+
+def _held(value: Any) -> bool:
+    """Whether float32 has this number; of what is none, too."""
+    if type(value) is Tensor or isinstance(value, torch.nn.Parameter):
+        return not value.dtype.is_floating_point or torch.equal(value.to(torch.float32).to(value.dtype), value)
+    return not isinstance(value, (float, np.floating)) or float(torch.tensor(float(value)).float()) == value
 
 
 def _narrowed(constant: Tensor, name: str) -> Tensor:

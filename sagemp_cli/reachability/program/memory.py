@@ -63,7 +63,6 @@ class Example:
         self._constants: dict[int, Tensor] = {}
         self._largest: float | None = None  # number among the operands
         self._recorder: Any = None
-        self._of_truth = False  # whether a truth value is among the operands
         self.result: Any = None
 
     def run(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Example:
@@ -89,7 +88,6 @@ class Example:
 
     def _tensor(self, value: Any) -> Tensor:
         ids, self._recorder = value.ids, value.recorder
-        self._of_truth |= value.truth
         storage = ids.untyped_storage()
         block = self._blocks.get(storage._cdata)
         if block is None:
@@ -131,7 +129,7 @@ class Example:
         if self._is_constant(result):
             return result  # a view of a constant is that constant, and what is written into it is
         truth, narrow = result.dtype is torch.bool, self._native and result.dtype is torch.float32
-        if not (result.dtype is torch.float64 or truth or narrow or (name == "float" and self._of_truth)):
+        if not (result.dtype is torch.float64 or truth or narrow):
             raise _other(name, f"gives {result.dtype}")
         ids = self._in_memory(answer.ids, result, name)
         if not self._same(ids, result):

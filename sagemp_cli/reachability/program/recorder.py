@@ -6,6 +6,8 @@ from, so that whatever only moves entries is done by torch itself, on ids.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -159,18 +161,28 @@ class Recorder:
         """Of all entries of an instruction's result."""
         return torch.arange(self._starts[slot], self._starts[slot] + self._instructions[slot].size)
 
-    def replaced(self, ids: Tensor, old: Tensor, new: Tensor) -> tuple[Tensor, tuple[str, ...]]:
+    def replaced(
+        self, ids: Tensor, old: Tensor, new: Tensor, *, own: Tensor, of: Tensor
+    ) -> tuple[Tensor, tuple[str, ...]] | None:
         """Values with these ids, computed again with other values in the places of some; and the kinds of instructions
-        that this takes, none if they do not depend on them.
+        that this takes, none if they do not depend on them. None if one depends on what is replaced for others.
 
         Args:
             ids: of what is computed again.
             old, new: ids, one for one; what is the same instruction on the same values is replaced too.
+            own, of: for which of the ids something is replaced: numbers for ``ids`` and for ``old``, alike where it is.
         """
         numbers: dict[Any, int] = {}
         number = [numbers.setdefault(key, len(numbers)) for key in self._keys(numbers)]
         known = dict(zip(old.reshape(-1).tolist(), new.reshape(-1).tolist(), strict=True))
-        alike = {(number[int(self._owner[o])], o - self._starts[int(self._owner[o])]): n for o, n in known.items()}
+        name = {o: (number[int(self._owner[o])], o - self._starts[int(self._owner[o])]) for o in known}
+        alike = {name[o]: n for o, n in known.items()}
+        bits = {mark: 1 << i for i, mark in enumerate(of.unique().tolist())}
+        marks = dict(zip(old.reshape(-1).tolist(), of.reshape(-1).tolist(), strict=True))
+        marked = {
+            (number[int(self._owner[o])], o - self._starts[int(self._owner[o])]): bits[m] for o, m in marks.items()
+        }
+        rests: dict[int, list[int]] = {}  # of every entry of a slot, on what it depends that is replaced, as bits
         made: dict[int, Tensor] = {}
         kinds: list[str] = []
 
@@ -191,6 +203,8 @@ class Recorder:
                 pending.update(self._instructions[slot].operands)
         for slot in sorted(order):
             i = self._instructions[slot]
+            rest = _depending(i, [rests[o] for o in i.operands])
+            rests[slot] = [marked.get((number[slot], place), r) for place, r in enumerate(rest)]
             before = [self.ids_of_slot(o) for o in i.operands]
             after = [translated(b) for b in before]
             if all(torch.equal(a, b) for a, b in zip(after, before, strict=True)):
@@ -203,6 +217,10 @@ class Recorder:
                 kinds.append(i.kind)
                 read = [self.operand(a, full=len(a) > 1) for a in after]
                 made[slot] = self.write(i.kind, read, i.constants)
+        for id_, mark in zip(ids.reshape(-1).tolist(), own.reshape(-1).tolist(), strict=True):
+            owner = int(self._owner[id_])
+            if rests[owner][id_ - self._starts[owner]] & ~bits.get(mark, 0):
+                return None
         return translated(ids), tuple(kinds)
 
     def rounded(self, kind: str, ids: Tensor) -> Tensor:
@@ -304,3 +322,17 @@ class Recorder:
 
 def _pick(slot: int, entries: Tensor) -> Instruction:
     return Instruction("pick", len(entries), (slot,), entries=tuple(entries.tolist()))
+
+
+def _depending(instruction: Instruction, operands: Sequence[list[int]]) -> list[int]:
+    """For every entry of a result the bits of the entries that it is made of."""
+    if instruction.kind == "pick":
+        return [operands[0][e] for e in instruction.entries]
+    if instruction.kind == "join":
+        return [bits for operand in operands for bits in operand]
+    if instruction.kind in MATRICES:
+        return [functools.reduce(operator.or_, operands[0], 0)] * instruction.size
+    found = [0] * instruction.size
+    for operand in operands:
+        found = [bits | operand[place if len(operand) > 1 else 0] for place, bits in enumerate(found)]
+    return found

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from sagemp_cli.errors import NonFiniteError, SagempError, UnsupportedOperationError, UsageError
-from sagemp_cli.reachability.program import float32
+from sagemp_cli.reachability.program import float32, truth
 from sagemp_cli.reachability.program.memory import Example
 from sagemp_cli.reachability.program.recorder import Recorder
 from sagemp_cli.reachability.program.tape import asked
@@ -327,6 +327,8 @@ def _assign(value: Traced, index: Any, part: Any) -> None:
         value._refuse(str(float32.mixed("assignment")))
     if value.float32 and not isinstance(part, Traced):
         part = float32.as_float32(part, "assignment")
+    if value.truth:
+        truth.require_truth("assignment", (part,), Traced)
     if isinstance(index, Traced) and index.truth:
         part = _answered(torch.where, (index, part, value), {})
         index = ...
@@ -372,25 +374,34 @@ def _answered(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> A
     answer = _in_place(name, args) if name.endswith("_") and not name.endswith("__") else _answer_of(function, name)
     # Torch goes first: what it refuses it must refuse before anything is written.
     narrow = float32.contains((args, kwargs), Traced, float32=True)
-    native = narrow or (name in float32.CONVERSIONS and not (isinstance(args[0], Traced) and args[0].truth))
+    native = narrow or name in float32.CONVERSIONS
     example = Example(Traced, native=native).run(function, args, kwargs)
     kwargs.pop("inplace", None)  # torch's functions hand it over by name
     narrow &= example.result_type in (torch.float32, torch.bool)
+    before = args, kwargs
     if narrow:
         float32.require_known(name, ANSWERS_OF_MOVES)
         float32.require_one_type(name, (args, kwargs), Traced)
         args, kwargs = (float32.as_float32(given, name) for given in (args, kwargs))
-    if name == "float" and args[0].truth:  # 1 and 0 in any type
-        answer = ANSWERS["double"]
+    of_truth = name in float32.CONVERSIONS and isinstance(args[0], Traced) and args[0].truth
+    if of_truth and example.result_type in (torch.float32, torch.float64):  # 1 and 0, which no rounding changes
+        answer = _unchanged
     if name != "where":
         args, kwargs = _as_numbers(args), _as_numbers(kwargs)
     try:
         with _computing_in_float32(args, kwargs) if narrow else contextlib.nullcontext():
-            return example.settle(answer(*args, **kwargs), name)
+            found = answer(*args, **kwargs)
+            if example.result_type is torch.bool:
+                truth.require_logic(name, (*before[0], *before[1].values()), Traced, moves=ANSWERS_OF_MOVES)
+            return example.settle(found, name)
     except TypeError as error:
         raise UnsupportedOperationError(
             f"torch operation '{name}' is not supported with these arguments: {error}"
         ) from error
+
+
+def _unchanged(value: Traced, *_: Any, **__: Any) -> Traced:
+    return value._like(value.ids)
 
 
 def _as_numbers(value: Any) -> Any:

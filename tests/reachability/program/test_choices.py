@@ -55,6 +55,12 @@ STEPS = {
     "nested": lambda x: torch.where(x > 0, torch.where(x > 0.5, x * x, x), torch.zeros_like(x)),
     "a branch that is not defined everywhere": lambda x: torch.where(x > 0.25, torch.sqrt(x - 0.25), x),
     "a quotient beside its pole": lambda x: torch.where(x.abs() > 0.25, 1 / x, 0 * x),
+    "a quotient of all": lambda x: torch.where(x > 0.25, 1 / (x.sum(-1, keepdim=True) + 9), 0 * x),
+    "a quotient of a neighbour": lambda x: torch.where(x > 0.25, 1 / (x.flip(-1) + 9), 0 * x),
+    "a root of a running sum": lambda x: torch.where(x < 0.25, torch.sqrt(x.cumsum(-1) + 90), 0 * x),
+    "a quotient for several conditions": lambda x: torch.where((x > 0.25)[:, None], 1 / (x + 9), 0 * x).sum(0),
+    "a mask as float32 numbers": lambda x: (x > 0).float() * 0.1 + x,
+    "a mask as float32 by its type": lambda x: (x > 0).to(torch.float32) * 0.1 + x,
     "a logarithm of the other side": lambda x: torch.where(0.1 - x > 0, torch.log(1.1 - x), x),
 }
 
@@ -68,6 +74,32 @@ def test_a_program_chooses_as_torch_does(name):
         program = record(lambda x, w: (torch.zeros_like(x), call(x)), example, ZERO)
         rows = torch.stack([call(row) for row in x])
         torch.testing.assert_close(program.run(x, ZERO).control, rows, rtol=1e-13, atol=1e-13)
+
+
+def written_into_a_mask(x, value):
+    mask = x > 0
+    mask[0] = value
+    return mask.double() * x
+
+
+NO_LOGIC = {
+    "sum of masks": lambda x: (x > 0) + (x > 0.1) + x,
+    "sum in place": lambda x: (x > 0).add_(x > 0.1) + x,
+    "a number written into a mask": lambda x: written_into_a_mask(x, 0.3),
+    "a value written into a mask": lambda x: written_into_a_mask(x, x[0]),
+    "a value copied into a mask": lambda x: (x > 0).copy_(x).double() + x,
+    "a mask filled with a number": lambda x: (x > 0).masked_fill(x > 5, 0.3).double() * x,
+    "logic of values": lambda x: torch.logical_and(x, x > 0).double() + x,
+    "not of values": lambda x: torch.logical_not(x).double() + x,
+}
+
+
+@pytest.mark.parametrize("name", NO_LOGIC)
+def test_what_torch_converts_to_truth_values_is_refused_whatever_the_example(name):
+    """At these states the numbers 1 and 0 give what truth values give, at others they do not."""
+    for example in ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.05, -1.0, -1.0], [0.0, -1.0, -1.0]):
+        with pytest.raises(UnsupportedOperationError):
+            record(lambda x, w: (torch.zeros_like(x), NO_LOGIC[name](x)), torch.tensor(example).double(), ZERO)
 
 
 BOUNDED = {

@@ -209,6 +209,12 @@ def subnormal(x):
         (lambda x: (x.float() * 1e39).double(), "no normal number of float32"),
         (lambda x: x.half().double(), "conversion to torch.float16"),
         (lambda x: torch.add(x.float(), torch.ones(2), alpha=0.1).double(), "from constants alone"),
+        (lambda x: (x.float().abs() ** 0.3).double(), "which is no float32 number"),
+        (
+            lambda x: torch.pow(x.float().abs(), torch.tensor(0.3, dtype=torch.float64)).double(),
+            "which is no float32 number",
+        ),
+        (lambda x: torch.nn.functional.softplus(x.float(), threshold=100.0).double(), "may overflow"),
     ],
 )
 def test_what_is_not_known_in_float32_is_refused(step, words):
@@ -224,6 +230,15 @@ def test_lirpa_refuses_float32():
 def test_limits_beside_float32_values_are_float32():
     tube = reach(lambda x: x.float().clamp(-0.1, 0.1).double(), Box.around([0.1], [0.1]), horizon=1)
     assert tube.upper[1, 0] == float(np.float32(0.1)) != 0.1
+
+
+def test_truth_values_in_float32_are_computed_with_in_float32():
+    tube = reach(lambda x: ((x > 0).float() * 0.1).double(), Box.around([1.0], [0.5]), horizon=1)
+    assert tube.lower[1, 0] <= float(np.float32(0.1)) <= tube.upper[1, 0]
+
+
+def test_products_of_float32_and_float64_values_are_float64_as_torch_makes_them():
+    assert kinds(lambda x: x.float().sum() * x).count("float32") == 1
 
 
 def test_comparisons_and_choices_of_float32_values():
