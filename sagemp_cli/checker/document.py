@@ -27,7 +27,7 @@ from sagemp_cli.reading.reader import read_tree
 from sagemp_cli.reading.tree import Dataset, Group
 from sagemp_cli.storage.content import ContentError, content_hash
 
-KINDS = {"sagemp/certificate": 4, "sagemp/library": 4}
+KINDS = {"sagemp/certificate": 4, "sagemp/library": 5}
 """Schemas that can be checked, with the version of their format."""
 _COMMANDS = {"sagemp/certificate": "verify", "sagemp/library": "build-library"}
 

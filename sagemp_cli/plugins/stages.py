@@ -19,8 +19,8 @@ GROUP = "sagemp.stages"
 _TAKEN = """
     artifacts build-library certificate check config demonstrations disturbance doctor dynamics dynamics-training effort
     execute executor experiment expert export gen-data horizon init inspect library name planner planner-training proof
-    propagator prove rollouts run safety safety-rates scene seed sources start status toy tracker tracker-training
-    train-dynamics train-planner train-tracker verify
+    propagator prove recheck rollouts run safety safety-rates scene seed sources start status toy tracker
+    tracker-training train-dynamics train-planner train-tracker verify
 """
 TAKEN = frozenset(_TAKEN.split())
 """Commands, sections of the config and kinds of file of the package; a stage is all three under one name."""

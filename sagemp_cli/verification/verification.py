@@ -182,7 +182,8 @@ def verify_references(
         counts: cells per uncertain start dimension, see :func:`~sagemp_cli.sets.partition.partition`; None for
             an adaptive partition, see :mod:`sagemp_cli.verification.adaptive`.
         budget: cells of one reference at most, in an adaptive partition.
-        cells_at_once: cells in one call of the propagator, which bounds its memory.
+        cells_at_once: cells in one call of the propagator, which bounds its memory. What it costs nothing to box is
+            looked for in all cells of a call together, so that tubes hang on this, by no more than that costs.
         executor: where the calls are made; here by default. The result does not depend on it.
         pieces: finished calls of an earlier, interrupted run of exactly these arguments; new ones are added.
         progress: reports cells.

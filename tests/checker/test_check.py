@@ -8,6 +8,8 @@ import torch
 import yaml
 from typer.testing import CliRunner
 
+from sagemp_cli import storage
+from sagemp_cli.checker import document
 from sagemp_cli.checker.check import check
 from sagemp_cli.cli.main import app
 from sagemp_cli.errors import ArtifactError
@@ -268,3 +270,8 @@ def test_the_command_says_what_was_proved(certificate, tmp_path):
     assert "reference 0: proved, keeps 0.467 m from disc" in result.output
     as_json = run(tmp_path / "certificate.h5", "--json")
     assert as_json.exit_code == 0 and '"answer": "VERIFIED"' in as_json.output
+
+
+def test_the_checker_knows_the_formats_that_are_written():
+    written = {f"sagemp/{kind.name}": kind.version for kind in storage.KINDS}
+    assert {schema: written[schema] for schema in document.KINDS} == document.KINDS

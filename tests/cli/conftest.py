@@ -70,7 +70,11 @@ def made_up(monkeypatch, example):
                     clearance=np.array([[1.5, 0.25]]),
                 )
                 found = () if safe else record.counterexamples
-                known = {"true_model": None} | state.certificate  # of an analytical robot
+                loop = dataclasses.replace(record.loop, lag=None)
+                known = {
+                    "true_model": None,
+                    "loop": loop,
+                } | state.certificate  # of an analytical robot
                 record = dataclasses.replace(record, tubes=tubes, counterexamples=found, **known)
             return context.write(stage.name, record, parents)
 

@@ -291,7 +291,7 @@ def test_inspect_shows_kind_provenance_fields_and_verdicts(sagemp, made_up):
     found = json.loads(sagemp("inspect", "--json", FOLDER / "certificate.h5").stdout)
     fields = {f["name"]: f for f in found["fields"]}
     assert fields["tubes/references"]["holds"] == "float64 (1, 6, 4)"
-    assert fields["tubes/clearance"]["units"] == "m"
+    assert fields["tubes/seconds"]["units"] == "s"
     assert fields["loop/lookahead"]["holds"] == "7" and found["claim"]["claims"][0][0] == "cannot be checked"
     assert found["verdicts"][0] == "VERIFIED"
     sagemp("train-planner", "--overwrite")

@@ -56,7 +56,8 @@ def test_what_is_written_is_a_library_that_check_proves(sagemp, toy_folder, move
     new = read_artifact(out, Library)
     assert new.header.config["scene"] == yaml.safe_load(there.read_text())
     assert new.record.tubes.constraint_names == ("workspace", "far away")
-    assert sagemp("check", out).exit_code == 0
+    checked = sagemp("check", out)
+    assert checked.exit_code == 0, checked.output
 
 
 def test_a_library_keeps_what_is_certified_and_counts_what_is_not(toy_folder):

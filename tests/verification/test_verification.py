@@ -12,6 +12,7 @@ from sagemp_cli.reachability.affine.affine import Affine
 from sagemp_cli.reachability.propagator import Propagator, Reach
 from sagemp_cli.scenes import Ball, Scene
 from sagemp_cli.sets import Box, Tube
+from sagemp_cli.sets.order_reduction import NOTHING
 from sagemp_cli.verification.cells import CellProver
 from sagemp_cli.verification.verdict import Outcome
 from sagemp_cli.verification.verification import require_references, verify_references
@@ -26,12 +27,13 @@ class Bare(Propagator):
     """A propagator without control bounds, which counts its calls."""
 
     calls: list
+    symbols: int | None = None
     name = "bare"
     rigorous = False
 
     def reach(self, loop, start, disturbance, *, watch=False):
         self.calls.append(len(start.lower))
-        return Reach(Affine().propagate(loop, start, disturbance))
+        return Reach(Affine(symbols=self.symbols).propagate(loop, start, disturbance))
 
 
 @pytest.fixture
@@ -83,11 +85,20 @@ def test_every_cell_of_every_reference_encloses_its_own_rollouts(unicycle, track
 
 def test_the_number_of_cells_at_once_changes_nothing_but_the_number_of_calls(unicycle, tracker):
     all_calls, few_calls = [], []
-    together = prove(Bare(all_calls), unicycle, tracker, references(2))
-    apart = prove(Bare(few_calls), unicycle, tracker, references(2), cells_at_once=5)
+    together = prove(Bare(all_calls, symbols=10_000), unicycle, tracker, references(2))
+    apart = prove(Bare(few_calls, symbols=10_000), unicycle, tracker, references(2), cells_at_once=5)
     assert all_calls == [12] and few_calls == [5, 5, 2]
     torch.testing.assert_close(apart.tube.lower, together.tube.lower, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(apart.tube.upper, together.tube.upper, rtol=1e-12, atol=1e-12)
+    assert apart.verdicts == together.verdicts
+
+
+def test_what_is_boxed_because_it_costs_nothing_hangs_on_the_cells_at_once_by_no_more_than_that(unicycle, tracker):
+    together = prove(Bare([]), unicycle, tracker, references(2))
+    apart = prove(Bare([]), unicycle, tracker, references(2), cells_at_once=5)
+    most = K * NOTHING * together.tube.width
+    assert bool(((apart.tube.lower - together.tube.lower).abs() <= most).all())
+    assert bool(((apart.tube.upper - together.tube.upper).abs() <= most).all())
     assert apart.verdicts == together.verdicts
 
 
