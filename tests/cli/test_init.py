@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,20 @@ def test_a_plan_of_its_own_goes_all_the_way_to_a_verdict_also_in_worker_processe
     assert artifact.header.config["dynamics"]["name"] == "rover" and "plugins" not in artifact.header.config
     planner = artifact.header.config["planner"]
     assert planner == {"name": "detour"}
+
+
+def test_the_tutorials_harder_question_is_about_the_files_that_are_there(rover):
+    """With next to no training, which stands in the experiment here."""
+    Path("conf/experiment/rover.yaml").rename("conf/experiment/whole.yaml")
+    Path("conf/experiment/rover.yaml").write_text(
+        "# @package _global_\ndefaults: [whole, override /planner: detour, _self_]\nname: rover\nhorizon: 12\n"
+        "tracker_training: {steps: 3, tube_steps: 0, references: 2, rollout_steps: 4, tube: null}\n"
+    )
+    assert rover("run", "--until", "train-tracker").exit_code == 0
+    commands = [line for line in Path("README.md").read_text().splitlines() if line.startswith("sagemp verify")]
+    assert len(commands) == 1
+    asked = rover(*shlex.split(commands[0])[1:], "verify.samples=0", "verify.falsifier.restarts=0")
+    assert asked.exit_code in (0, 5, 10), asked.output
 
 
 def test_an_artifact_of_a_robot_that_nobody_here_knows_is_one_line_and_loads_nothing(rover, monkeypatch):
