@@ -417,11 +417,11 @@ def _as_numbers(value: Any) -> Any:
 def _computing_in_float32(*arguments: Any) -> Iterator[None]:
     """What is recorded meanwhile is computed in float32."""
     recorder = _first(arguments).recorder
-    recorder.float32 = True
+    before, recorder.float32 = recorder.float32, True
     try:
         yield
     finally:
-        recorder.float32 = False
+        recorder.float32 = before
 
 
 def _first(values: Any) -> Any:

@@ -232,6 +232,17 @@ def test_limits_beside_float32_values_are_float32():
     assert tube.upper[1, 0] == float(np.float32(0.1)) != 0.1
 
 
+def test_products_of_float32_values_round_whatever_the_example():
+    x = torch.tensor([1.0, 2.0], dtype=torch.float64)  # of which nothing is rounded
+
+    def step(x, w):
+        h = x.float()
+        return ((h[:, None] * h[None, :]) @ h).double()
+
+    found = [i.kind for i in record(step, x, torch.zeros(1, dtype=torch.float64)).instructions]
+    assert found.count("mul") == 2 and found.count("float32") == 2 + found.count("mul") and "float32_linear" in found
+
+
 def test_truth_values_in_float32_are_computed_with_in_float32():
     tube = reach(lambda x: ((x > 0).float() * 0.1).double(), Box.around([1.0], [0.5]), horizon=1)
     assert tube.lower[1, 0] <= float(np.float32(0.1)) <= tube.upper[1, 0]
