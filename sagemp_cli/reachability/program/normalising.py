@@ -86,7 +86,13 @@ def softmin(x: Traced, dim: int | None = None, _stacklevel: int = 3, dtype: Any 
 
 
 def _divided(x: Traced, dims: list[int], eps: float, most: float) -> Traced:
-    """Values over the root of the mean of their squares, which together allow no larger one than ``most``."""
+    """Values over the root of the mean of their squares, which together allow no larger one than ``most``.
+
+    Raises:
+        UnsupportedOperationError: a negative ``eps``, which takes the limit away.
+    """
+    if not eps >= 0:
+        raise UnsupportedOperationError(f"a layer that normalises needs an eps of at least 0, found {eps}")
     size = elementwise("sqrt", add(mean(square(x), dims, keepdim=True), eps))
     return clamp(divide(x, size), -most, most)
 

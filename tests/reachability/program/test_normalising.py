@@ -121,3 +121,17 @@ def test_a_controller_with_attention_to_goals_keeps_a_loop_bounded():
         states.append(Loop().step(k, states[-1], w.sample(300, generator)))
     inside = torch.stack(states, 1)
     assert bool(((tube.lower - 1e-12 <= inside) & (inside <= tube.upper + 1e-12)).all())
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [
+        lambda x: F.layer_norm(x, (2,), eps=-1e-3),
+        lambda x: F.group_norm(x[None], 1, eps=-1e-3)[0],
+        lambda x: F.rms_norm(x, (2,), eps=-1e-3),
+    ],
+    ids=["layer_norm", "group_norm", "rms_norm"],
+)
+def test_a_layer_whose_values_have_no_limit_is_refused(layer):
+    with pytest.raises(UnsupportedOperationError, match="needs an eps of at least 0, found -0.001"):
+        reach(lambda x, w: layer(x), Box([0.5, 1.0], [0.6, 1.1]), horizon=1)
