@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from sagemp_cli.checker.check import check
+from sagemp_cli.checker.document import KINDS
 from sagemp_cli.errors import ArtifactError
 from sagemp_cli.loop.closed_loop import ClosedLoop
 from sagemp_cli.storage import Counterexample
@@ -254,7 +255,7 @@ def test_of_constraints_with_one_name_the_nearest_is_reported(certificate, mutat
 
 def test_a_library_is_not_falsified_by_saying_so(make, mutate, tmp_path):
     def change(file):
-        file.attrs["schema"] = "sagemp/library"
+        file.attrs["schema"], file.attrs["schema_version"] = "sagemp/library", KINDS["sagemp/library"]
         file["data"].attrs["verdict"] = "FALSIFIED"
 
     path = make(disc=[0.4, 0.3]).write(tmp_path / "unknown.h5")
