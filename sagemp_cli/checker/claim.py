@@ -2,6 +2,8 @@
 
 Everything here is read off the numbers that a check is about: the sets, the scene, the program, the stored bounds.
 What is only said by the file and proved by nothing (its experiment, names, seconds) is kept apart.
+
+Longer than other files: whether the claim is told in full is to be seen in one place.
 """
 
 from __future__ import annotations

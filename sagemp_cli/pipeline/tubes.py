@@ -16,7 +16,7 @@ from sagemp_cli.reachability.recording import Recording
 from sagemp_cli.sets import PARTS, Between, Box, Tube
 from sagemp_cli.storage import Counterexample, FlowBounds, Relaxations, Tubes
 from sagemp_cli.verification.attack.falsifier import Counterexample as Found
-from sagemp_cli.verification.verdict import Outcome, Verdict
+from sagemp_cli.verification.verdict import Assessment, Outcome, Verdict
 from sagemp_cli.verification.verification import Verification
 
 
@@ -35,13 +35,7 @@ def tubes_record(v: Verification) -> Tubes:
         tube_upper=v.tube.upper.numpy(),
         control_lower=v.control_lower.numpy(),
         control_upper=v.control_upper.numpy(),
-        verdict=tuple(str(x.outcome) for x in v.verdicts),
-        step=np.array([x.step for x in v.verdicts], dtype=np.int64),
-        fraction=np.array([x.fraction for x in v.verdicts]),
-        constraint=tuple(x.constraint for x in v.verdicts),
-        constraint_names=v.constraint_names,
-        clearance=v.clearance.numpy(),
-        goal_margin=v.goal_margin.numpy(),
+        **_verdicts(v, v.constraint_names),
         seconds=v.seconds.numpy(),
         propagator=v.propagator,
         rigorous=v.rigorous,
@@ -50,6 +44,23 @@ def tubes_record(v: Verification) -> Tubes:
         relaxations=None if v.recording is None else relaxations_record(v.recording),
         flow=None if v.flow is None else flow_record([v.flow]),
     )
+
+
+def judged(tubes: Tubes, found: Assessment, constraint_names: tuple[str, ...]) -> Tubes:
+    """The same tubes with the verdicts of another scene."""
+    return dataclasses.replace(tubes, **_verdicts(found, constraint_names))
+
+
+def _verdicts(found: Assessment | Verification, constraint_names: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "verdict": tuple(str(x.outcome) for x in found.verdicts),
+        "step": np.array([x.step for x in found.verdicts], dtype=np.int64),
+        "fraction": np.array([x.fraction for x in found.verdicts]),
+        "constraint": tuple(x.constraint for x in found.verdicts),
+        "constraint_names": constraint_names,
+        "clearance": found.clearance.numpy(),
+        "goal_margin": found.goal_margin.numpy(),
+    }
 
 
 def flows_of(record: FlowBounds, tube: Tube) -> list[tuple[np.ndarray, Flow]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sagemp_cli.config.folders import load_scene
 from sagemp_cli.errors import UsageError
 from sagemp_cli.library.builder import REASON_OF, REASONS
-from sagemp_cli.pipeline.tubes import flows_of, selected
+from sagemp_cli.pipeline.tubes import flows_of, judged, selected
 from sagemp_cli.scenes.scene import Scene, scene_from_mapping
 from sagemp_cli.sets import Between, Box, Bulge, Tube
 from sagemp_cli.storage import (
@@ -150,29 +150,15 @@ def _assessed(tubes: Tubes, loop: LoopRecord, scene: Scene, some: NDArray[np.boo
     )
 
 
-def _judged(tubes: Tubes, scene: Scene, found: Assessment) -> Tubes:
-    """The same tubes with the verdicts of another scene."""
-    return dataclasses.replace(
-        tubes,
-        verdict=tuple(str(v.outcome) for v in found.verdicts),
-        step=np.array([v.step for v in found.verdicts], dtype=np.int64),
-        fraction=np.array([v.fraction for v in found.verdicts]),
-        constraint=tuple(v.constraint for v in found.verdicts),
-        constraint_names=scene.constraint_names,
-        clearance=found.clearance.numpy(),
-        goal_margin=found.goal_margin.numpy(),
-    )
-
-
 def _certificate(record: Certificate, loop: LoopRecord, scene: Scene, found: Assessment) -> Certificate:
     """For the other scene, which the counterexamples and the further plans are not about."""
     true = record.true_model
     if true is not None:
-        own = _judged(true.tubes, scene, _assessed(true.tubes, loop, scene))
+        own = judged(true.tubes, _assessed(true.tubes, loop, scene), scene.constraint_names)
         true = dataclasses.replace(true, tubes=own)
     return dataclasses.replace(
         record,
-        tubes=_judged(record.tubes, scene, found),
+        tubes=judged(record.tubes, found, scene.constraint_names),
         counterexamples=(),
         falsifier_rollouts=0,
         verdict=str(answer_of(found.verdicts)),
@@ -191,7 +177,7 @@ def kept_library(record: Library, scene: Scene, found: Assessment) -> Library:
     counts = Counter(dict(zip(record.reason_names, record.reason_counts.tolist(), strict=True))) + Counter(reasons)
     return dataclasses.replace(
         record,
-        tubes=selected(_judged(tubes, scene, found), np.flatnonzero(safe)),
+        tubes=selected(judged(tubes, found, scene.constraint_names), np.flatnonzero(safe)),
         mode=tuple(mode for mode, kept in zip(record.mode, safe, strict=True) if kept),
         rejected_references=np.concatenate([record.rejected_references, tubes.references[lost]]),
         rejected_reason=(*record.rejected_reason, *reasons),

@@ -4,6 +4,8 @@ Dimensions: ``count`` demonstrations or references, ``K`` steps, ``n`` states, `
 partitions together, ``rollouts`` simulated runs, ``bins`` of a histogram. Arrays are time first after the count.
 Numbers are finite but where ``finite=False`` says otherwise: bounds that overflowed are infinite, figures that were
 not measured NaN.
+
+Longer than other files, since every kind is declared here: what a file may hold is to be read in one place.
 """
 
 from __future__ import annotations
