@@ -2,7 +2,8 @@
 
 A network is read as the real function that it describes: weights are the exact (float32 or float64) numbers that are
 stored, sums and products are exact, activations are the real ones. Casts between float32 and float64 are therefore the
-identity. An inference engine that computes in float32 differs by its own rounding, which no proof here speaks of.
+identity. An inference engine that computes in float32 differs by its own rounding, of which only a proof speaks that
+calls the layers in float32 (:mod:`.layers`).
 
 Longer than other files, since every operator that is supported is here, and no other is.
 """

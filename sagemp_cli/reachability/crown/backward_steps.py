@@ -12,6 +12,8 @@ variables here: wherever they come in, the sum of their coefficients' absolute v
 
 Layout. Every matrix maps the positive and negative parts of entries, side by side as columns, to a block of rows: the
 gain, the magnitude, and the coefficients of the variables before. Cells come first.
+
+Longer than other files, since whoever reads one of these matrices has to know how the others are laid out.
 """
 
 from __future__ import annotations
