@@ -11,7 +11,7 @@ nothing else: the file can be copied onto a robot, with one that ``sagemp export
             stop(alarm)
 
 Nothing here raises while the robot moves: whatever comes, a state of the wrong size, NaN, a clock that jumps, a step
-too many, is an alarm. The first alarm stays: what is proved ends with it. Runs on Python 3.8 and later.
+too many, is an alarm. The first alarm stays: what is proved ends with it. In the syntax of Python 3.8.
 """
 
 from __future__ import annotations
